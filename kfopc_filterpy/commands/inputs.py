@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,18 +23,48 @@ if TYPE_CHECKING:
 STANDARD_INPUT = "-"
 
 
+class _Named(NamedTuple):
+    """What an argument names: a file, and perhaps one of its channels or variables."""
+
+    file: str
+    channel: int | None = None
+    variable: str | None = None
+
+
+def _named(argument: str) -> _Named:
+    """Return what is named by "x.wav", "x.wav:1", "x.mat:S" or "x.mat:S:1"."""
+    parts: dict[str, Any] = {}
+    file = argument
+    while file != STANDARD_INPUT and not Path(file).exists():
+        file, colon, part = file.rpartition(":")
+        kind = "channel" if part.isdecimal() else "variable"
+        if not colon or kind in parts:
+            return _Named(argument)  # there is no such file, as its reader will say
+        parts[kind] = int(part) if kind == "channel" else part
+    return _Named(file, **parts)
+
+
 class Files:
     """Reader of the files of a command, which must agree on their sample rate."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
-        self.fs = 0.0  # of the files that were read; 0 before the first
         self.remarks: list[str] = []  # on flaws of the recordings that resampling hides
+        self._fs = 0.0  # of the files that were read; 0 before the first
         self._first = ""
+        self._without_rate = False  # whether a file stated none
+        self._recorded: dict[tuple[Any, ...], str] = {}  # channels of recordings, and the arguments that named them
+
+    @property
+    def fs(self) -> float:
+        """Sample rate in Hz of all files, once they were read."""
+        if self.options.file_fs is not None and not self._without_rate:
+            raise ValueError("--file-fs is for files that state no rate, but all of them do: leave it out, or use --fs")
+        return self._fs
 
     def recording(self, path: str) -> np.ndarray:
         """Return the samples of a recording, one channel."""
-        return _only_channel(self._read(path, is_path=False), path)
+        return _only_channel(self._recording(path), path)
 
     def path(self, path: str) -> np.ndarray:
         """Return the taps of a path."""
@@ -44,7 +74,7 @@ class Files:
         """Return all channels of a recording, (n_channels, n_samples), none of them silent."""
         from ..paths.file_checks import require_heard
 
-        channels = np.atleast_2d(self._read(path, is_path=False).samples)
+        channels = np.atleast_2d(self._recording(path).samples)
         require_heard(path, channels)
         return channels
 
@@ -53,7 +83,7 @@ class Files:
         from ..paths.file_checks import require_shorter, require_sound
 
         matrix = self.matrix(paths, option, self.options.microphones)
-        require_shorter(", ".join(paths), matrix.shape[-1], self.options.noise, noise.shape[-1], self.fs)
+        require_shorter(", ".join(paths), matrix.shape[-1], self.options.noise, noise.shape[-1], self._fs)
         require_sound(paths[0] if len(paths) == 1 else option, matrix)
         return matrix
 
@@ -69,11 +99,16 @@ class Files:
         if len(rows) % count:
             raise ValueError(
                 f"{option} must give a path to each of the {count} microphone(s) from every source, got {len(rows)} in all: "
-                "choose one channel with --channel, or see the order of several with kfopc verdict --help"
+                "choose one channel of a file, as in file.wav:0, or see the order of several with kfopc verdict --help"
             )
         longest = max(row.size for row in rows)
         padded = np.array([np.pad(row, (0, longest - row.size)) for row in rows])
         return padded.reshape(-1, count, longest).swapaxes(0, 1)
+
+    def _recording(self, path: str) -> Recording:
+        read = self._read(path, is_path=False)
+        self._require_new(path, len(np.atleast_2d(read.samples)))
+        return read
 
     def _read(self, path: str, *, is_path: bool) -> Recording:
         """Read a file, whose rate must be that of the files before it."""
@@ -87,45 +122,71 @@ class Files:
         if is_path and read.samples.shape[-1] > LONG_PATH_S * read.fs:
             seconds = read.samples.shape[-1] / read.fs
             warn(self.options, f"{path} lasts {seconds:.3g} s, too long for an impulse response: is it a recording?")
-        if self.fs and read.fs != self.fs:
+        if self._fs and read.fs != self._fs:
             raise ValueError(
-                f"{path} is sampled at {read.fs:g} Hz, {self._first} at {self.fs:g} Hz: resample both to one rate, for "
+                f"{path} is sampled at {read.fs:g} Hz, {self._first} at {self._fs:g} Hz: resample both to one rate, for "
                 "example with --fs 16000"
             )
-        self.fs, self._first = read.fs, self._first or path
+        self._fs, self._first = read.fs, self._first or path
         return read
 
     def _chosen(self, path: str, source: str, is_path: bool, fs: float | None) -> Recording:
+        """Return the channels of a file that its argument or the options choose, at a rate."""
         from ..paths import read_path
         from ..signals import read_recording
+        from ..signals.recordings import read_content
 
-        read = (read_path if is_path else read_recording)(source, fs=fs, variable=self.options.variable)
+        variable = _named(path).variable or self.options.variable
+        file_fs = None
+        if read_content(source, variable=variable).fs is None:
+            file_fs, self._without_rate = self.options.file_fs, True
+            if file_fs is None:
+                raise ValueError(
+                    f"{path} states no sampling rate: give the rate in Hz at which it was sampled, for example with "
+                    "--file-fs 48000 (--fs is the rate to which files are resampled)"
+                )
+        read = (read_path if is_path else read_recording)(source, fs=fs, file_fs=file_fs, variable=variable)
         return _with_channel(read, path, self.options.channel)
+
+    def _require_new(self, path: str, n_channels: int) -> None:
+        """Raise ValueError if a channel of a recording was read before: it would be compared with itself."""
+        named = _named(path)
+        channel = self.options.channel if named.channel is None else named.channel
+        for own in range(n_channels) if channel is None else (channel,):
+            key = (Path(named.file).resolve(), named.variable, own)
+            if key in self._recorded:
+                raise ValueError(
+                    f"{self._recorded[key]} and {path} are the same channel of one recording: name the channel of each, as "
+                    f"in {named.file}:0 and {named.file}:1"
+                )
+            self._recorded[key] = path
 
 
 def _with_channel(read: Recording, path: str, channel: int | None) -> Recording:
-    """Return the chosen channel of a recording; one with a single channel stays as it is."""
+    """Return the channel that is named with a file, or else the one that is chosen for all files with several."""
     from ..signals.recordings import as_channel
 
-    if channel is None or read.samples.ndim == 1:
+    named = _named(path).channel
+    if named is None and (channel is None or read.samples.ndim == 1):
         return read
-    return replace(read, samples=read.samples[as_channel(channel, read.samples, path, called="--channel")])
+    samples = np.atleast_2d(read.samples)
+    which, called = (channel, "--channel") if named is None else (named, f"the channel in {path}")
+    return replace(read, samples=samples[as_channel(which, samples, path, called=called)])
 
 
 def _only_channel(read: Recording, path: str) -> np.ndarray:
     if read.samples.size != read.samples.shape[-1]:
-        raise ValueError(
-            f"{path} has {len(read.samples)} channels where one is needed: choose with --channel 0 to --channel "
-            f"{len(read.samples) - 1}"
-        )
+        last = len(read.samples) - 1
+        raise ValueError(f"{path} has {last + 1} channels where one is needed: name one of {path}:0 to {path}:{last}")
     return read.one_channel()
 
 
 @contextmanager
 def _file(path: str) -> Iterator[str]:
-    """Yield the name of a file, or for "-" the name of a copy of the standard input."""
-    if path != STANDARD_INPUT:
-        yield path
+    """Yield the name of the file that an argument names, or for "-" the name of a copy of the standard input."""
+    file = _named(path).file
+    if file != STANDARD_INPUT:
+        yield file
         return
     content = sys.stdin.buffer.read()
     if not content:
@@ -151,8 +212,8 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, 
     if primary is not None and primary.shape[:2] != (len(secondary), len(noise)):
         raise ValueError(
             f"--primary must give a path from each of the {len(noise)} channel(s) of {options.noise} to each of the "
-            f"{len(secondary)} microphone(s), got {primary.shape[1]} to {primary.shape[0]}: choose with --channel 0 to "
-            f"--channel {max(len(noise), 2) - 1}, or see the order of several with kfopc verdict --help"
+            f"{len(secondary)} microphone(s), got {primary.shape[1]} to {primary.shape[0]}: choose a channel, as in "
+            f"{options.noise}:0, or see the order of several with kfopc verdict --help"
         )
     if options.disturbance is not None:
         disturbance = files.channels(options.disturbance)
@@ -160,7 +221,7 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, 
         if len(disturbance) != len(secondary):
             raise ValueError(
                 f"--disturbance must have a channel for each of the {len(secondary)} microphone(s) of --secondary, got "
-                f"{len(disturbance)}: record all microphones together, or choose one with --channel"
+                f"{len(disturbance)}: record all microphones together, or choose one, as in {options.disturbance}:0"
             )
     return noise, primary, secondary, disturbance
 
@@ -207,13 +268,15 @@ def _rating(own: argparse.Namespace) -> list[Any]:
         )
     ratings: list[Any] = []
     volts = own.volts_per_unit or 1.0
+    used = {"rated_power"}
     if own.watt is not None or own.peak_volts is not None:
         if own.ohm is None:
             raise ValueError("--watt and --peak-volts need --ohm, the resistance they were measured with")
         if own.rated_power is not None:
             raise ValueError("--rated-power stands in place of --watt and --peak-volts: leave out one of them")
-        watts = {f"{own.rating}_watt": own.watt}
+        watts = {f"{own.rating or 'sine'}_watt": own.watt}
         ratings.append(AmplifierRating(own.ohm, peak_volts=own.peak_volts, volts_per_unit=volts, **watts))
+        used |= {"watt", "peak_volts", "ohm", "volts_per_unit"} | ({"rating"} if own.watt is not None else set())
     elif own.rated_power is not None:
         ratings.append(own.rated_power)
     if (own.loudspeaker_watt, own.programme_watt, own.x_max_mm) != (None, None, None):
@@ -229,21 +292,27 @@ def _rating(own: argparse.Namespace) -> list[Any]:
                 volts_per_unit=volts,
             )
         )
+        used |= {*OF_A_LOUDSPEAKER} - ({"ohm"} if own.impedance is not None else set())
     if not ratings:
         raise ValueError("a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6")
+    unused = [f"--{name.replace('_', '-')}" for name, value in vars(own).items() if value is not None and name not in used]
+    if unused:
+        raise ValueError(
+            f"{' and '.join(unused)} would not be used: --ohm, --rating and --volts-per-unit belong to --watt, and "
+            "--impedance to --loudspeaker-watt, --programme-watt or --x-max-mm; add these, or leave it out"
+        )
     return ratings
 
 
 def _curve(path: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return two columns of a CSV file: frequencies, and values in a unit."""
+    """Return the first two columns of a text file: frequencies, and values in a unit."""
     from ..power.ratings import as_curve
+    from ..signals.content import reading, require_file
+    from ..signals.text import read_table
 
-    try:
-        columns = np.loadtxt(path, delimiter=",", ndmin=2)
-    except ValueError as error:
-        raise ValueError(f"{path} must hold two numbers in a line with a comma between them: {error}") from error
-    if columns.shape[1] != 2:
-        raise ValueError(f"{path} must hold two columns, Hz and a value in {unit}, got {columns.shape[1]}")
+    require_file(path)
+    with reading(path, f"a curve, two columns of Hz and {unit}"):
+        columns = read_table(path, n_least=2).columns
     return as_curve((columns[:, 0], columns[:, 1]), path, unit)
 
 
@@ -282,7 +351,8 @@ def calibration_of(options: argparse.Namespace, n_microphones: int) -> ArrayLike
             raise ValueError("--calibrator stands in place of --pascal-per-unit: leave out one of them")
         option, pascals = "--calibrator", []
         for path in options.calibrator:
-            read = _with_channel(read_recording(path), path, options.channel)
+            named = _named(path)
+            read = _with_channel(read_recording(named.file, variable=named.variable), path, options.channel)
             tone = replace(read, samples=_only_channel(read, path))
             pascals.append(calibration_factor(tone, options.calibrator_db))
     each = _each(pascals, option, n_microphones, "microphone")

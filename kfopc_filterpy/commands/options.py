@@ -69,8 +69,11 @@ def add_reading(
 ) -> None:
     """Add the options for reading files."""
     add_number(parser, "--fs", "Hz", help=about_fs, **of_fs)
-    add_count(parser, "--channel", 0, help="channel to read from files with several, counted from 0")
-    parser.add_argument("--variable", metavar="NAME", help="variable to read from files with several")
+    add_number(parser, "--file-fs", "Hz", help="rate of the files that state none")
+    about = "channel to read from files with several, counted from 0; for one file, name it as in FILE:0"
+    add_count(parser, "--channel", 0, help=about)
+    about = "variable to read from files with several; for one file, name it as in FILE:NAME"
+    parser.add_argument("--variable", metavar="NAME", help=about)
 
 
 def add_scene(parser: argparse._ActionsContainer, *, required: bool) -> None:
@@ -102,7 +105,6 @@ def add_recorded_scene(parser: argparse._ActionsContainer) -> None:
     rating.add_argument(
         "--rating",
         choices=("sine", "noise"),
-        default="sine",
         help="signal with which the watts were measured (default: sine, which is on the safe side)",
     )
     add_number(rating, "--peak-volts", "V", help="voltage at which the amplifier clips", **each)

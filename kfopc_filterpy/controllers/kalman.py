@@ -252,6 +252,7 @@ def kf_opc(
     n_references: int = 1,
     amplifier: Amplifiers = None,
     limiter: Limiters = None,
+    fs: float | None = None,
 ) -> DirectKalman:
     """Return KF-OPC, the Kalman filter with output power constraint (eq. 9-13).
 
@@ -263,7 +264,9 @@ def kf_opc(
         Rated output power rho_o of all loudspeakers, or of each.
     constraint : OutputPowerConstraint or sequence of J of them, optional
         Alternative to `rated_power`: a rated power with the settings of its power estimates, for example the sample
-        rate. A copy is kept. With `rated_power`, the sample rate is that of the suggested settings, or 16 kHz.
+        rate. A copy is kept.
+    fs : float, optional
+        Sample rate in Hz of the power estimates of a `rated_power`; by default that of suggested settings, or 16 kHz.
 
     Returns
     -------
@@ -293,7 +296,7 @@ def kf_opc(
         n_taps,
         secondary_path,
         {"state_noise": state_noise, "measurement_noise": measurement_noise, "initial_variance": initial_variance},
-        constraint=suggested_constraint(n_taps, rated_power, constraint),
+        constraint=suggested_constraint(n_taps, rated_power, constraint, fs),
         n_references=n_references,
         amplifier=amplifier,
         limiter=limiter,
@@ -322,10 +325,13 @@ def with_suggested(
 
 
 def suggested_constraint(
-    n_taps: int | SuggestedSettings, rated_power: PerLoudspeaker | None, constraint: Constraints
+    n_taps: int | SuggestedSettings, rated_power: PerLoudspeaker | None, constraint: Constraints, fs: float | None
 ) -> Any:
-    """Return `constraint_for`, for the sample rate of suggested settings if `n_taps` are such."""
-    fs = n_taps.fs if isinstance(n_taps, SuggestedSettings) else DEFAULT_FS
+    """Return `constraint_for` at a sample rate, by default that of suggested settings if `n_taps` are such."""
+    if constraint is not None and fs is not None:
+        raise ValueError("fs belongs to rated_power: a constraint has its own, OutputPowerConstraint(..., fs=...)")
+    if fs is None:
+        fs = n_taps.fs if isinstance(n_taps, SuggestedSettings) else DEFAULT_FS
     return constraint_for(rated_power, constraint, fs)
 
 

@@ -96,6 +96,7 @@ def kf_opc_repaired(
     factor_at: str = "output",
     amplifier: Amplifier | None = None,
     limiter: OutputLimiter | None = None,
+    fs: float | None = None,
 ) -> RepairedKFOPC:
     r"""Return KF-OPC with its gain repaired, so that eq. 13 also keeps the rated power on paths that are not flat.
 
@@ -120,6 +121,8 @@ def kf_opc_repaired(
     factor_at : {"output", "measurement"}, default "output"
         Signal that the factor is applied to: the control signal, on which it acts at once, or the measurement (eq. 9),
         on which it acts as fast as the filter adapts.
+    fs : float, optional
+        As for `kf_opc`.
 
     Returns
     -------
@@ -143,7 +146,7 @@ def kf_opc_repaired(
         n_taps,
         secondary_path,
         {"state_noise": state_noise, "measurement_noise": measurement_noise, "initial_variance": initial_variance},
-        constraint=suggested_constraint(n_taps, rated_power, constraint),
+        constraint=suggested_constraint(n_taps, rated_power, constraint, fs),
         gain_of=gain_of,
         trim_s=trim_s,
         factor_at=factor_at,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 LONG_PATH_S = 5.0  # hardly any impulse response is longer
-LONGEST_PATH_S = 10.0
+LONGEST_PATH_S, MOST_TAPS = 10.0, 65536  # of an impulse response
 
 
 def require_shorter(path: str, n_taps: int, noise: str, n_samples: int, fs: float) -> None:
@@ -13,12 +13,12 @@ def require_shorter(path: str, n_taps: int, noise: str, n_samples: int, fs: floa
 
     `path` and `noise` are the names of the files.
     """
-    if n_taps < n_samples and n_taps <= LONGEST_PATH_S * fs:
+    if n_taps < n_samples and n_taps <= min(LONGEST_PATH_S * fs, MOST_TAPS):
         return
     raise ValueError(
         f"{path} has {n_taps} samples ({n_taps / fs:.3g} s), {noise} {n_samples} ({n_samples / fs:.3g} s): an impulse "
-        f"response must be shorter than the noise, and at most {LONGEST_PATH_S:g} s long; cut the impulse response, or "
-        "are the files swapped?"
+        f"response must be shorter than the noise, and at most {LONGEST_PATH_S:g} s and {MOST_TAPS} taps long; cut the "
+        "impulse response, or are the files swapped?"
     )
 
 

@@ -176,7 +176,12 @@ def sampling_rate(path: PathModel, fs: float | None = None, *, name: str = "path
 
 
 def finite_taps(system: System) -> np.ndarray | None:
-    """Return the exact taps of a transfer function with a finite impulse response, or None for other systems."""
+    """Return the exact taps of a system with a finite impulse response, or None for other systems."""
+    if hasattr(system, "A"):  # D, CB, CAB, ... until A^n B is 0, which n states do not outlast
+        state, taps = system.B, [system.D]
+        for _ in range(len(system.A)):
+            taps, state = [*taps, system.C @ state], system.A @ state
+        return None if np.any(state) else np.ravel(taps)
     if not hasattr(system, "num_array"):
         return None
     numerator, denominator = system.num_array[0, 0], system.den_array[0, 0]

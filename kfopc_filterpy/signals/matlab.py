@@ -18,9 +18,12 @@ from .hdf5 import NUMERIC_CLASSES, read_mat73
 
 _COMPRESSED, _MATRIX = 15, 14  # MATLAB's numbers for these elements
 _UINT32, _NUMBER_TYPES = 6, {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}  # of the numbers in an element
+_TEXT_TYPES = {16, 17, 18}
 _NUMBER_CLASSES, _COMPLEX = range(6, 16), 0x800  # of a variable: double to uint64, and the flag beside it
-_CELL, _CHAR, _WITH_FIELDS = 1, 4, {2: 3, 3: 4}  # classes: cell, text; of a struct and an object, where their names begin
+_CELL, _CHAR, _SPARSE, _WITH_FIELDS = 1, 4, 5, {2: 3, 3: 4}  # classes; of a struct and an object, where their names begin
 _WITH_ELEMENTS = (_CELL, _CHAR, *_WITH_FIELDS)
+# Parts of a variable: flags, dimensions and name, and what its class adds. Complex numbers have one more.
+_PARTS = {**dict.fromkeys(_NUMBER_CLASSES, 4), _CELL: 3, _CHAR: 4, _SPARSE: 6, 2: 5, 3: 6}
 _MOST_VARIABLES = 10_000  # in structs and cells: each takes a hundred bytes or more in memory
 _HEADER = 128  # bytes
 
@@ -132,7 +135,6 @@ def _require_honest_parts(path: str | os.PathLike[str], body: Any, order: str) -
             f"{path} is damaged: {len(body)} bytes claim to be type {kind} of {size} bytes, expected a variable"
         )
     own_class = flags & 0xFF
-    is_numeric = own_class in _NUMBER_CLASSES
     begin, end, parts, count = 8, 8 + size, [], 1
     while begin + 8 <= end:
         kind, part = struct.unpack_from(f"{order}II", body, begin)
@@ -147,10 +149,10 @@ def _require_honest_parts(path: str | os.PathLike[str], body: Any, order: str) -
             if count > _MOST_VARIABLES:
                 raise ValueError(f"{path} holds more than {_MOST_VARIABLES} variables in one: store arrays of numbers")
         begin = at + part + (-part) % 8 if at == begin + 8 else begin + 8
-    # Flags, dimensions and name; then, of numbers, the real part and the imaginary part.
-    needed = 3 if not is_numeric else 5 if flags & _COMPLEX else 4
-    types = [part.kind for part in parts]
-    if len(types) < needed or not set(types[:needed]) <= _NUMBER_TYPES:
+    needed = _PARTS.get(own_class, 3) + (own_class in (_SPARSE, *_NUMBER_CLASSES) and flags & _COMPLEX > 0)
+    types, dimensions = [part.kind for part in parts], parts[1].content if len(parts) > 1 else b""
+    known = _NUMBER_TYPES | (_TEXT_TYPES if own_class == _CHAR else set())
+    if len(types) < needed or not set(types[:needed]) <= known or (own_class in _PARTS and len(dimensions) < 8):
         raise ValueError(
             f"{path} is damaged: a variable has parts of the types {types[:8]}, expected {needed} with numbers"
         )

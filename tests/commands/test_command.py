@@ -7,8 +7,11 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from helpers.commands import FS, ROOT, SCENE, process
+
+from kfopc_filterpy.signals import write_wav
 
 
 def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
@@ -36,7 +39,7 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
             ["verdict", "noise.wav", "--secondary", "S.wav", "--rated-power", "1"],
             "--primary or --disturbance is needed",
         ),
-        (["verdict", "stereo.wav", *SCENE[1:], "--rated-power", "1"], "choose with --channel 0 to --channel 1"),
+        (["verdict", "stereo.wav", *SCENE[1:], "--rated-power", "1"], "choose a channel, as in stereo.wav:0"),
         (
             ["verdict", "stereo.wav", *SCENE[1:], "--rated-power", "1", "--channel", "2"],
             "verdict: --channel must be below the 2",
@@ -74,7 +77,7 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
         (
             ["compare", "S.wav", "--primary", "P.wav", "--secondary", "noise.wav", "--rated-power", "1"],
             "P.wav has 64 samples (0.008 s), S.wav 64 (0.008 s): an impulse response must be shorter than the noise, "
-            "and at most 10 s long; cut the impulse response, or are the files swapped?",
+            "and at most 10 s and 65536 taps long; cut the impulse response, or are the files swapped?",
         ),
         (["verdict", *SCENE[:3], "--secondary", "silent.wav", "--rated-power", "1"], "silent.wav must not be silent"),
         (
@@ -102,6 +105,33 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
             ["verdict", *SCENE, "--ohm", "8", "--loudspeaker-watt", "1", "--impedance", "falling.csv"],
             "of falling.csv must",
         ),
+        # An option that nothing uses.
+        *(
+            (["verdict", *SCENE, *rating.split()], f"{unused} would not be used")
+            for rating, unused in (
+                ("--watt 20 --ohm 8 --impedance no-such.csv", "--impedance"),
+                ("--rated-power 1 --impedance falling.csv", "--impedance"),
+                ("--rated-power 1 --ohm 8 --volts-per-unit 2", "--ohm and --volts-per-unit"),
+                ("--rated-power 1 --rating sine", "--rating"),
+                ("--rated-power 1 --ohm 8 --loudspeaker-watt 5 --impedance rising.csv", "--ohm"),
+            )
+        ),
+        (["paths", "convert", "S.wav", "x.npy", "--file-fs", "8000"], "--file-fs is for files that state no rate"),
+        (["paths", "convert", "untimed.npy", "x.wav", "--fs", "8000"], "untimed.npy states no sampling rate: give the rate"),
+        (["paths", "resample", "untimed.npy", "x.wav", "--fs", "8000"], "for example with --file-fs 48000"),
+        (["paths", "convert", "stereo.wav", "x.npy"], "name one of stereo.wav:0 to stereo.wav:1"),
+        (["paths", "convert", "stereo.wav:2", "x.npy"], "the channel in stereo.wav:2 must be below the 2 channel(s)"),
+        (["paths", "convert", "S.wav:1", "x.npy"], "the channel in S.wav:1 must be below the 1 channel(s) of S.wav:1"),
+        (["paths", "convert", "S.wav:0:1", "x.npy"], "S.wav:0:1 does not exist"),
+        (["paths", "convert", "S.wav:S", "x.npy"], "S.wav is an audio file, which has no named variables"),
+        (
+            ["paths", "identify", "stereo.wav", "stereo.wav", "--channel", "0", "--taps", "8", "-o", "x.npy"],
+            "stereo.wav and stereo.wav are the same channel of one recording: name the channel of each, as in stereo.wav:0",
+        ),
+        (
+            ["verdict", "stereo.wav", "--disturbance", "./stereo.wav:1", "--secondary", "S.wav", "--rated-power", "1"],
+            "stereo.wav and ./stereo.wav:1 are the same channel",
+        ),
         (["compare", *SCENE, "--rated-power", "1", "--seconds", "0"], "--seconds must be greater than 0 s, got 0"),
         (["explore", "--port", "-1"], "--port must be at least 0, got -1"),
         (["paths", "resample", "S.wav", "x.wav", "--fs", "8000.5"], "take another --fs, or write .csv"),
@@ -120,6 +150,15 @@ def test_an_error_is_one_line_that_says_what_to_do(command, arguments, message):
     assert message in err
     assert err.count("\n") == 1
     assert err.startswith("kfopc")
+
+
+def test_a_path_of_far_too_many_taps_is_refused_before_anything_runs(command, folder):
+    write_wav(folder / "minutes.wav", np.resize([1.0, -1.0, 0.5], 71000), FS)
+    rows = "".join(f"{n / 8:.3f},{n % 2}\n" for n in range(70000))
+    (folder / "endless.csv").write_text(f"Time,S\n(ms),(V)\n{rows}")
+    code, _, err = command("verdict", "minutes.wav", *SCENE[1:3], "--secondary", "endless.csv", "--rated-power", "1")
+    assert code == 2
+    assert "endless.csv has 70000 samples (8.75 s), minutes.wav 71000 (8.88 s): an impulse response must be shorter" in err
 
 
 @pytest.mark.parametrize("name", ["jinja2", "PIL", "tqdm"])
@@ -189,7 +228,8 @@ def test_rates_that_differ_are_resampled_each_in_its_way(command):
             "--disturbance must have a channel for each",
         ),
         (
-            ["--primary", "P1.wav", "--secondary", "S.npy", "--secondary", "S1.wav", "--rated-power", "1"],
+            ["--primary", "P1.wav", "--secondary", "S.npy", "--secondary", "S1.wav", "--rated-power", "1"]
+            + ["--file-fs", "8000"],
             "leave out the other",
         ),
         (

@@ -8,6 +8,8 @@ from inspect import signature
 import jsonschema
 import numpy as np
 import pytest
+import scipy.io
+import soundfile
 from helpers.commands import FS, SCENE, process
 
 from kfopc_filterpy import bench
@@ -112,7 +114,39 @@ def test_a_loudspeakers_curves_are_read_from_files(command, folder):
     (folder / "words.csv").write_text("Hz,mm\n")
     code, _, err = command("verdict", *SCENE, *rating, "--x-max-mm", "1", "--displacement", "words.csv")
     assert code == 2
-    assert "words.csv must hold two numbers in a line" in err
+    assert "words.csv is text that is no numbers" in err
+
+
+@pytest.mark.parametrize(
+    "curve",
+    [
+        "* Hz Ohms Deg\n20.5 7.1 17.3\n80 40 5\n300 6.4 1.5\n",  # .zma
+        "Hz,ohm\n20,7\n80,40\n300,6.4\n",
+        "Hz;Ohm\n20,5;7,1\n80;40\n300;6,4\n",
+        "20\t7\n80\t40\n300\t6.4\n",
+    ],
+)
+def test_a_curve_has_frequencies_and_values_in_its_first_columns(command, folder, curve):
+    (folder / "curve.zma").write_text(curve)
+    rating = ["--watt", 100, "--ohm", 8, "--loudspeaker-watt", 1, "--impedance", "curve.zma"]
+    out = command("verdict", *SCENE, *rating, "--taps", 16, "--json", "--algorithm", "FxLMS")[1]
+    assert json.loads(out)["rating"]["rated_power"] == pytest.approx(6.4)
+
+
+def test_channels_and_variables_are_named_with_their_files(command, folder):
+    """Noise and disturbance in one sound file, and both paths in one .mat file, are as good as four files."""
+    signals = {name: soundfile.read(folder / f"{name}.wav")[0] for name in ("noise", "d", "P", "S")}
+    write_wav(folder / "both.wav", [signals["d"], signals["noise"]], FS)
+    scipy.io.savemat(folder / "paths.mat", {"P": {"ir": signals["P"], "fs": FS}, "S": {"ir": signals["S"], "fs": FS}})
+    options = ["--rated-power", 4, "--taps", 32, "--json", "--algorithm", "FxLMS"]
+    apart = command("verdict", "noise.wav", "--disturbance", "d.wav", "--secondary", "S.wav", *options)
+    named = command("verdict", "both.wav:1", "--disturbance", "both.wav:0", "--secondary", "paths.mat:S.ir", *options)
+    assert named[0] == apart[0] == 0
+    one, other = json.loads(named[1]), json.loads(apart[1])
+    assert one["noise_reduction_db"] == other["noise_reduction_db"]
+    assert one["bound_db"] == other["bound_db"]
+    paths = ["--primary", "paths.mat:P.ir", "--secondary", "paths.mat:S.ir"]
+    assert command("verdict", "both.wav:1", *paths, *options)[0] == 0
 
 
 def test_a_calibrators_recording_gives_the_levels(command, folder):
@@ -136,7 +170,7 @@ WAYS = {
         ["S11.wav", "S21.wav", "S12.wav", "S22.wav"],
         ["--microphones", 2],
     ],
-    "one array": [["P1.wav"], ["S.npy"], ["--fs", FS]],  # it states no rate
+    "one array": [["P1.wav"], ["S.npy"], ["--file-fs", FS]],  # it states no rate
 }
 
 
