@@ -295,7 +295,9 @@ def _rating(own: argparse.Namespace) -> list[Any]:
         used |= {*OF_A_LOUDSPEAKER} - ({"ohm"} if own.impedance is not None else set())
     if not ratings:
         raise ValueError("a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6")
-    unused = [f"--{name.replace('_', '-')}" for name, value in vars(own).items() if value is not None and name not in used]
+    unused = [
+        f"--{name.replace('_', '-')}" for name, value in vars(own).items() if value is not None and name not in used
+    ]
     if unused:
         raise ValueError(
             f"{' and '.join(unused)} would not be used: --ohm, --rating and --volts-per-unit belong to --watt, and "

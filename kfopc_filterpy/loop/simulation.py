@@ -15,10 +15,11 @@ from .._validate import as_channels, as_count, as_positive, as_signal, per_louds
 from ..controllers.base import Controller, Looped, checked_controller, differing_counts, listening
 from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
-from ..paths.models import path_taps
+from ..paths.models import path_taps, sampling_rate
 from ..paths.path_matrix import feedback_paths, is_path_matrix, secondary_paths
 from ..power.amplifiers import Amplifier, amplifier_models, amplifier_of_each, compiled_model
 from ..power.constraint import DEFAULT_FS
+from ..signals.recordings import Recording
 from .inputs import (
     DIVERGENCE_LIMIT,
     SensorNoise,
@@ -68,13 +69,13 @@ def simulate(
     controller : Controller
         Controller. It continues from its present state, while the paths start silent: make a new one for a fresh run.
     reference : array_like
-        (n_samples,) reference x, or (I, n_samples).
+        (n_samples,) reference x, or (I, n_samples). Signals and paths may be a `Recording`, whose rate must be `fs`.
     secondary_path : array_like or control.TransferFunction
         True secondary path s, loudspeaker amplifier to error microphone. With several channels (K, J, n_taps), or a
         matrix of systems: nested lists, or a system of several inputs and outputs.
     primary_path : array_like or control.TransferFunction, optional
         Path from the reference to the error microphone, which gives the disturbance p*x; (K, I, n_taps) or a matrix of
-        systems.
+        systems; with one reference also (K, n_taps).
     disturbance : array_like, optional
         (n_samples,) disturbance d, or (K, n_samples), in place of `primary_path`.
     fs : float, default 16000
@@ -132,6 +133,9 @@ def simulate(
     """
     checked_controller(controller)
     fs = as_positive(fs, "fs", unit="Hz")
+    for name, signal in (("reference", reference), ("disturbance", disturbance)):
+        if isinstance(signal, Recording):
+            sampling_rate(signal, fs, name=name)
     several = is_multichannel(controller, reference, secondary_path, disturbance)
     x, d, secondary = _read_signals(reference, primary_path, disturbance, secondary_path, fs, several)
     K, J, _ = secondary.shape

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from .._types import PathModel, System
 from .._validate import as_band, as_count, as_number, as_positive, as_signal
+from ..signals.recordings import Recording
 
 if TYPE_CHECKING:
     import control
@@ -126,15 +127,20 @@ def is_system(path: object) -> TypeGuard[System]:
     return hasattr(path, "dt") and hasattr(path, "ninputs")
 
 
+def tells_rate(path: object) -> bool:
+    """Tell whether `path` states its sampling rate, as a python-control system and a recording do."""
+    return is_system(path) or isinstance(path, Recording)
+
+
 def sampling_rate(path: PathModel, fs: float | None = None, *, name: str = "path") -> float:
-    """Return the sampling rate of a path in Hz: a system's own, or `fs` for a tap array.
+    """Return the sampling rate of a path in Hz: a system's or a recording's own, or `fs` for a tap array.
 
     Parameters
     ----------
-    path : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
+    path : control.TransferFunction, control.StateSpace, Recording or array_like, shape (n_taps,)
         A discrete-time single-channel system, or an impulse response.
     fs : float, optional
-        Sampling rate in Hz: needed for a tap array; for a system it must agree with its ``dt``.
+        Sampling rate in Hz: needed for a tap array; with a system or a recording it must agree.
     name : str, default "path"
         The argument's name in error messages.
 
@@ -155,6 +161,10 @@ def sampling_rate(path: PathModel, fs: float | None = None, *, name: str = "path
     """
     if fs is not None:
         fs = as_positive(fs, "fs", unit="Hz")
+    if isinstance(path, Recording):
+        if fs not in (None, path.fs):
+            raise ValueError(f"{name} is sampled at {path.fs:g} Hz but fs is {fs:g} Hz; read it with fs={fs:g}")
+        return path.fs
     if not is_system(path):
         if fs is None:
             raise ValueError(f"fs must be given if {name} is a tap array, which carries no sampling rate")
@@ -226,9 +236,10 @@ def path_taps(path: PathModel, *, fs: float | None = None, n_taps: int | None = 
     """
     if n_taps is not None:
         n_taps = as_count(n_taps, "n_taps")
+    if tells_rate(path):
+        sampling_rate(path, fs, name=name)
     if not is_system(path):
         return _cut(as_signal(path, name), n_taps, name)
-    sampling_rate(path, fs, name=name)
     if hasattr(path, "num_array") and path.num_array[0, 0].size > path.den_array[0, 0].size:
         raise ValueError(f"{name} must be causal, but its numerator has a higher degree than its denominator")
     taps = finite_taps(path)

@@ -8,7 +8,7 @@ import numpy as np
 
 from .._types import PathModels
 from .._validate import as_real_array, require_finite
-from .models import is_system, path_taps, sampling_rate, stacked
+from .models import is_system, path_taps, sampling_rate, stacked, tells_rate
 
 SECONDARY_AXES = "(K microphones, J loudspeakers, taps)"
 PRIMARY_AXES = "(K microphones, I references, taps)"
@@ -24,13 +24,19 @@ def secondary_paths(
 def primary_paths(
     paths: PathModels, *, fs: float | None = None, name: str = "primary_path"
 ) -> tuple[np.ndarray, float | None]:
-    """Return primary paths as taps (K, I, n_taps), and their sampling rate in Hz if systems tell it."""
+    """Return primary paths as taps (K, I, n_taps), and their sampling rate in Hz if systems tell it.
+
+    Taps (K, n_taps) are those of one reference.
+    """
+    if not is_system(paths) and not _has_systems(paths) and np.ndim(paths) == 2:
+        rate = sampling_rate(paths, fs, name=name) if tells_rate(paths) else None
+        return path_matrix(as_real_array(paths, name)[:, np.newaxis], fs=fs, name=name, axes=PRIMARY_AXES)[0], rate
     return path_matrix(paths, fs=fs, name=name, axes=PRIMARY_AXES)
 
 
 def single_path(path: PathModels, name: str, fs: float | None = None) -> tuple[np.ndarray, float | None]:
     """Return one path as taps, (n_taps,), and its sampling rate in Hz if a system tells it."""
-    return path_taps(path, fs=fs, name=name), sampling_rate(path, fs, name=name) if is_system(path) else None
+    return path_taps(path, fs=fs, name=name), sampling_rate(path, fs, name=name) if tells_rate(path) else None
 
 
 def feedback_paths(paths: PathModels, several: bool, fs: float | None = None) -> tuple[np.ndarray, float | None]:
@@ -70,12 +76,12 @@ def path_matrix(
     if max(taps.shape[:2]) > taps.shape[2]:
         raise ValueError(f"{name} must have shape {axes}, got {taps.shape}: taps come last, see numpy.moveaxis")
     require_finite(taps, name)
-    return np.ascontiguousarray(taps), None
+    return np.ascontiguousarray(taps), sampling_rate(paths, fs, name=name) if tells_rate(paths) else None
 
 
 def _has_systems(paths: Any) -> bool:
     rows = paths if isinstance(paths, list | tuple) else ()
-    return any(is_system(entry) for row in rows if isinstance(row, list | tuple) for entry in row)
+    return any(tells_rate(entry) for row in rows if isinstance(row, list | tuple) for entry in row)
 
 
 def sampled_path_matrix(paths: PathModels, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float]:
@@ -87,7 +93,7 @@ def sampled_path_matrix(paths: PathModels, fs: float | None, name: str, axes: st
 def _from_systems(rows: Any, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float | None]:
     if len({len(row) for row in rows}) != 1:
         raise ValueError(f"{name} must be {axes}: its rows differ in length")
-    rates = {sampling_rate(path, fs, name=name) for row in rows for path in row if is_system(path)}
+    rates = {sampling_rate(path, fs, name=name) for row in rows for path in row if tells_rate(path)}
     if len(rates) > 1:
         raise ValueError(f"{name} has systems of different sampling rates: {sorted(rates)} Hz")
     entries = [(path, f"{name}[{k}][{j}]") for k, row in enumerate(rows) for j, path in enumerate(row)]

@@ -163,7 +163,9 @@ def _rate_and_start(
             rates.append(rate_of_step(step, path))
             starts.append(float(one[0]))
         if rates and max(rates) > (1 + _SAME_RATE) * min(rates):
-            raise ValueError(f"{path} states several sampling rates beside {name!r}, {sorted(rates)} Hz: leave only one")
+            raise ValueError(
+                f"{path} states several sampling rates beside {name!r}, {sorted(rates)} Hz: leave only one"
+            )
         if rates:
             return rates[0], starts[0] if starts else 0.0
     return None, 0.0
@@ -171,7 +173,9 @@ def _rate_and_start(
 
 def _are_times(name: str, shape: tuple[int, ...], signal: tuple[int, ...]) -> bool:
     """Return whether a variable holds the times of a signal's samples, by its name and its shape."""
-    return name.rpartition(".")[2].lower() in _TIME_NAMES and math.prod(shape) == max(shape, default=0) == max(signal) > 2
+    return (
+        name.rpartition(".")[2].lower() in _TIME_NAMES and math.prod(shape) == max(shape, default=0) == max(signal) > 2
+    )
 
 
 def _name_of(

@@ -124,6 +124,10 @@ class Recording:
             )
         return self.samples.reshape(-1)
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """Return the samples: whatever takes an array takes a recording."""
+        return np.array(self.samples, dtype=dtype) if copy else np.asarray(self.samples, dtype=dtype)
+
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.samples.shape))
         other = f" ({self.file_fs:g} Hz in the file)" if self.file_fs not in (None, self.fs) else ""
@@ -305,7 +309,11 @@ def read_content(path: str | os.PathLike[str], *, channel: int | None = None, va
         content = _NAMED[kind](path, variable) if kind in _NAMED else _UNNAMED[kind](path)
     if content.fs is not None and not (math.isfinite(content.fs) and content.fs > 0):
         raise ValueError(f"{path} states a sampling rate of {content.fs:g} Hz, expected one above 0")
-    if content.samples.ndim == 3 and kind != "a SOFA file" and max(content.samples.shape[:2]) >= content.samples.shape[2]:
+    if (
+        content.samples.ndim == 3
+        and kind != "a SOFA file"
+        and max(content.samples.shape[:2]) >= content.samples.shape[2]
+    ):
         raise ValueError(
             f"{path} has the shape {content.samples.shape}, expected (microphones, loudspeakers, taps) with the taps last: "
             "which axis is which? Store it in that order; (taps, microphones, loudspeakers) becomes it with MATLAB's "

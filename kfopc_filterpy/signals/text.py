@@ -66,7 +66,9 @@ def read_table(path: str | os.PathLike[str], *, n_least: int = 1) -> Table:
         names = header[-1].strip() if header else ""
         if _is_decimal(path, names, islice(_lines(path), layout.first, None)):
             layout = layout._replace(delimiter=None, has_decimal_comma=True)
-    columns = np.loadtxt(map(layout.plain, islice(_lines(path), layout.first, None)), delimiter=layout.delimiter, ndmin=2)
+    columns = np.loadtxt(
+        map(layout.plain, islice(_lines(path), layout.first, None)), delimiter=layout.delimiter, ndmin=2
+    )
     if columns.shape[1] < n_least:
         raise ValueError(f"{path} must hold {n_least} columns, got {columns.shape[1]}")
     return Table(header, columns)
@@ -165,7 +167,9 @@ def _read_labview(path: str | os.PathLike[str], head: list[str]) -> Content:
     ends = [index for index, line in enumerate(head) if line.startswith(_END_OF_HEADER)]
     n_segments = sum(line.startswith(_END_OF_HEADER) for line in _lines(path)) - 1
     if len(ends) < 2 or n_segments != 1:
-        raise ValueError(f"{path} is a LabVIEW measurement of {n_segments} segments, expected one: export a file for each")
+        raise ValueError(
+            f"{path} is a LabVIEW measurement of {n_segments} segments, expected one: export a file for each"
+        )
     delimiter = "," if any(line.startswith("Separator,Comma") for line in head) else "\t"
     names, *fields = (line.rstrip().split(delimiter) for line in (head[ends[1] + 1], *head[: ends[1]]))
     values = {field[0]: field[1:] for field in fields}
@@ -174,9 +178,7 @@ def _read_labview(path: str | os.PathLike[str], head: list[str]) -> Content:
     def plain(line: str) -> str:
         return line.replace(",", ".") if has_decimal_comma else line
 
-    steps, starts = (
-        {float(plain(one)) for one in values.get(name, []) if one.strip()} for name in ("Delta_X", "X0")
-    )
+    steps, starts = ({float(plain(one)) for one in values.get(name, []) if one.strip()} for name in ("Delta_X", "X0"))
     if len(steps) > 1 or len(starts) > 1:
         raise ValueError(f"{path} holds channels of different rates or starts (Delta_X, X0): export a file for each")
     channels = [index for index, name in enumerate(names) if not name.startswith(("X_Value", "Comment"))]

@@ -117,7 +117,10 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
             )
         ),
         (["paths", "convert", "S.wav", "x.npy", "--file-fs", "8000"], "--file-fs is for files that state no rate"),
-        (["paths", "convert", "untimed.npy", "x.wav", "--fs", "8000"], "untimed.npy states no sampling rate: give the rate"),
+        (
+            ["paths", "convert", "untimed.npy", "x.wav", "--fs", "8000"],
+            "untimed.npy states no sampling rate: give the rate",
+        ),
         (["paths", "resample", "untimed.npy", "x.wav", "--fs", "8000"], "for example with --file-fs 48000"),
         (["paths", "convert", "stereo.wav", "x.npy"], "name one of stereo.wav:0 to stereo.wav:1"),
         (["paths", "convert", "stereo.wav:2", "x.npy"], "the channel in stereo.wav:2 must be below the 2 channel(s)"),
@@ -158,7 +161,9 @@ def test_a_path_of_far_too_many_taps_is_refused_before_anything_runs(command, fo
     (folder / "endless.csv").write_text(f"Time,S\n(ms),(V)\n{rows}")
     code, _, err = command("verdict", "minutes.wav", *SCENE[1:3], "--secondary", "endless.csv", "--rated-power", "1")
     assert code == 2
-    assert "endless.csv has 70000 samples (8.75 s), minutes.wav 71000 (8.88 s): an impulse response must be shorter" in err
+    assert (
+        "endless.csv has 70000 samples (8.75 s), minutes.wav 71000 (8.88 s): an impulse response must be shorter" in err
+    )
 
 
 @pytest.mark.parametrize("name", ["jinja2", "PIL", "tqdm"])

@@ -109,6 +109,18 @@ def test_infinite_response_as_transfer_function_and_state_space():
 
 
 @pytest.mark.parametrize(
+    ("matrices", "expected"),
+    [
+        (([], [], [], [[0.7]]), [0.7]),
+        (([[0, 0], [1, 0]], [[1], [0]], [[0.5, 0.2]], [[0]]), [0.0, 0.5, 0.2]),
+        (([[0, 1], [0, 0]], [[1], [0]], [[0.5, 0.2]], [[0.3]]), [0.3, 0.5, 0.0]),  # the second state is never reached
+    ],
+)
+def test_a_state_space_with_a_finite_response_is_exact(matrices, expected):
+    assert path_taps(control.StateSpace(*matrices, 1 / FS)).tolist() == expected
+
+
+@pytest.mark.parametrize(
     ("path", "arguments", "message"),
     [
         (bandpass_path(32), {"fs": 8000.0}, "path is sampled at 16000 Hz but fs is 8000 Hz"),

@@ -19,9 +19,7 @@ from kfopc_filterpy.signals import read_recording
 SCOPE = "Time,Channel A\n({unit}),(V)\n\n{rows}"
 
 
-@pytest.mark.parametrize(
-    ("unit", "scale"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("µs", 1e6), ("ns", 1e9)]
-)
+@pytest.mark.parametrize(("unit", "scale"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("µs", 1e6), ("ns", 1e9)])
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
 def test_a_line_of_units_gives_the_unit_of_the_times(tmp_path, unit, scale, encoding):
     rows = "".join(f"{n / 48000 * scale:.6f},{n % 3}\n" for n in range(300))
@@ -119,7 +117,8 @@ def test_labview_of_several_segments_or_rates_is_refused(tmp_path):
 
 @pytest.mark.parametrize("read", [read_path, read_recording])
 @pytest.mark.parametrize(
-    "header", ["* Freq(Hz) SPL(dB) Phase(degrees)", "Frequency;SPL", "* Hz Ohms Deg", "* Frequency Step: 0.366 Hz\n* step SPL"]
+    "header",
+    ["* Freq(Hz) SPL(dB) Phase(degrees)", "Frequency;SPL", "* Hz Ohms Deg", "* Frequency Step: 0.366 Hz\n* step SPL"],
 )
 def test_a_frequency_response_is_refused(tmp_path, read, header):
     rows = "".join(f"{20 + 0.366 * n:.3f} 80.0 -90.0\n" for n in range(300))
@@ -263,7 +262,9 @@ def hdf5_struct(path, content):
 def test_the_fields_of_a_struct_are_named(tmp_path, write):
     path = tmp_path / "x.mat"
     write(path, {"P": {"ir": SIGNAL, "fs": 8000.0}, "S": {"ir": 2 * SIGNAL, "fs": float(FS)}})
-    with pytest.raises(ValueError, match=r"x\.mat holds several variables: P\.fs .*, P\.ir .*; choose one .* x\.mat:P\.ir\)"):
+    with pytest.raises(
+        ValueError, match=r"x\.mat holds several variables: P\.fs .*, P\.ir .*; choose one .* x\.mat:P\.ir\)"
+    ):
         read_path(path)
     chosen = read_path(path, variable="S.ir")
     assert chosen.fs == FS
@@ -277,7 +278,9 @@ def test_the_fields_of_a_struct_are_named(tmp_path, write):
 def test_a_matrix_of_paths_whose_taps_are_not_last_is_asked_for_its_axes(tmp_path, shape, suffix):
     path, taps = tmp_path / f"x.{suffix}", np.ones(shape)
     scipy.io.savemat(path, {"S": taps}) if suffix == "mat" else np.save(path, taps)
-    with pytest.raises(ValueError, match=rf"x\.{suffix} .*\({shape[0]}, {shape[1]}, 4\).*microphones, loudspeakers, taps"):
+    with pytest.raises(
+        ValueError, match=rf"x\.{suffix} .*\({shape[0]}, {shape[1]}, 4\).*microphones, loudspeakers, taps"
+    ):
         read_path(path, fs=FS)
 
 
