@@ -70,6 +70,12 @@ class Files:
         """Return the taps of a path."""
         return _only_channel(self._read(path, is_path=True), path)
 
+    def calibrator(self, path: str) -> Recording:
+        """Return the recording of a calibrator, one channel, at any rate."""
+        with _file(path) as source:
+            read = self._chosen(path, source, False, None)
+        return replace(read, samples=_only_channel(read, path))
+
     def channels(self, path: str) -> np.ndarray:
         """Return all channels of a recording, (n_channels, n_samples), none of them silent."""
         from ..paths.file_checks import require_heard
@@ -167,11 +173,13 @@ def _with_channel(read: Recording, path: str, channel: int | None) -> Recording:
     from ..signals.recordings import as_channel
 
     named = _named(path).channel
-    if named is None and (channel is None or read.samples.ndim == 1):
+    called = "--channel" if named is None else f"the channel in {path}"
+    if named is None and read.samples.ndim > 1:
+        named = channel
+    if named is None:
         return read
     samples = np.atleast_2d(read.samples)
-    which, called = (channel, "--channel") if named is None else (named, f"the channel in {path}")
-    return replace(read, samples=samples[as_channel(which, samples, path, called=called)])
+    return replace(read, samples=samples[as_channel(named, samples, path, called=called)])
 
 
 def _only_channel(read: Recording, path: str) -> np.ndarray:
@@ -343,9 +351,9 @@ def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndar
     return np.concatenate(every, axis=1).reshape(K, -1, J, longest).swapaxes(0, 1)
 
 
-def calibration_of(options: argparse.Namespace, n_microphones: int) -> ArrayLike | None:
+def calibration_of(options: argparse.Namespace, files: Files, n_microphones: int) -> ArrayLike | None:
     """Return the pascals per unit of the error microphones, of all or of each; None if the options give none."""
-    from ..signals import calibration_factor, read_recording
+    from ..signals import calibration_factor
 
     pascals, option = options.pascal_per_unit, "--pascal-per-unit"
     if options.calibrator is not None:
@@ -353,9 +361,6 @@ def calibration_of(options: argparse.Namespace, n_microphones: int) -> ArrayLike
             raise ValueError("--calibrator stands in place of --pascal-per-unit: leave out one of them")
         option, pascals = "--calibrator", []
         for path in options.calibrator:
-            named = _named(path)
-            read = _with_channel(read_recording(named.file, variable=named.variable), path, options.channel)
-            tone = replace(read, samples=_only_channel(read, path))
-            pascals.append(calibration_factor(tone, options.calibrator_db))
+            pascals.append(calibration_factor(files.calibrator(path), options.calibrator_db))
     each = _each(pascals, option, n_microphones, "microphone")
     return each[0] if pascals is None or len(pascals) == 1 else each

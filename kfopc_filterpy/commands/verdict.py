@@ -90,7 +90,7 @@ def verdict(options: argparse.Namespace) -> int:
             n_taps=options.taps,
             memory_s=options.memory,
             secondary_path_uncertainty=uncertainty_of(options, files, secondary),
-            pascal_per_unit=calibration_of(options, n_microphones),
+            pascal_per_unit=calibration_of(options, files, n_microphones),
             bar=bar,
         )
         advice = advice_on(found, fs="--fs ", n_taps="--taps ")

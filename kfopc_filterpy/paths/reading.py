@@ -42,7 +42,7 @@ def read_path(
     channel : int, optional
         Channel to read, from 0. By default all are read.
     variable : str, optional
-        Variable of a .mat or .npz file. By default the only one with several values.
+        Variable of a .mat or .npz file, or field of a struct: "meas.ir". By default the only one with several values.
     unit : str, optional
         Unit of the taps, after scaling: "Pa/V". By default what the file states, or "1".
     unit_per_full_scale : float, optional

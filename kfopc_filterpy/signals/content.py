@@ -146,7 +146,8 @@ def _rate_and_start(
     """
     folder = name.rpartition(".")[0]
     for inside in dict.fromkeys((folder, "")):
-        numbers, times = {}, []
+        numbers: dict[str, list[float]] = {}
+        times: list[np.ndarray] = []
         for key, shape in shapes.items():
             place, _, own = key.rpartition(".")
             if place == inside and math.prod(shape) == 1:

@@ -150,11 +150,11 @@ def read_recording(
     level_db: float = 94.0,
     file_fs: float | None = None,
 ) -> Recording:
-    """Read a recording: WAV, RF64, FLAC, AIFF, MATLAB, .npy, .npz, text, CSV or UFF.
+    """Read a recording: WAV, RF64, FLAC, AIFF, MATLAB, .npy, .npz, text, CSV, LabVIEW's .lvm or UFF.
 
     The suffix of the file tells its format, or else how the file begins. Whole-number samples of audio files are scaled
     so that full scale is 1. In formats that hold arrays, the longer axis is time. A first column of text that rises evenly
-    is time in seconds (or the number of the sample, if it rises by 1) and is left out. The page *File formats* has all of it.
+    is time (in seconds, or the unit of its heading; without one, the sample number if it rises by 1) and is left out. The page *File formats* has all of it.
 
     Nothing is unpickled. Files that are compressed may become at most 64 MiB or 100 times their size, whichever is more.
 
@@ -168,7 +168,7 @@ def read_recording(
     channel : int, optional
         Channel to read, from 0. By default all are read.
     variable : str, optional
-        Variable of a .mat or .npz file. By default the only one with several values.
+        Variable of a .mat or .npz file, or field of a struct: "meas.ir". By default the only one with several values.
     unit : str, optional
         Unit of the samples, after scaling. By default what the file states, or "1".
     unit_per_full_scale : float, optional

@@ -181,7 +181,7 @@ def _read_labview(path: str | os.PathLike[str], head: list[str]) -> Content:
     steps, starts = ({float(plain(one)) for one in values.get(name, []) if one.strip()} for name in ("Delta_X", "X0"))
     if len(steps) > 1 or len(starts) > 1:
         raise ValueError(f"{path} holds channels of different rates or starts (Delta_X, X0): export a file for each")
-    channels = [index for index, name in enumerate(names) if not name.startswith(("X_Value", "Comment"))]
+    channels = [index for index, name in enumerate(names) if name and not name.startswith(("X_Value", "Comment"))]
     lines = map(plain, islice(_lines(path), ends[1] + 2, None))
     columns = np.loadtxt(lines, delimiter=delimiter, usecols=channels, comments=None, ndmin=2)
     fs = rate_of_step(steps.pop(), path) if steps else None

@@ -233,8 +233,7 @@ def test_rates_that_differ_are_resampled_each_in_its_way(command):
             "--disturbance must have a channel for each",
         ),
         (
-            ["--primary", "P1.wav", "--secondary", "S.npy", "--secondary", "S1.wav", "--rated-power", "1"]
-            + ["--file-fs", "8000"],
+            ["--primary", "P1.wav", "--secondary", "S.npy", "--secondary", "S1.wav", "--file-fs", "8000"],
             "leave out the other",
         ),
         (
