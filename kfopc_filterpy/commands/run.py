@@ -95,6 +95,12 @@ def _sound_card(options: argparse.Namespace) -> Interface:
             "a recording with --primary and --secondary is needed for a simulated plant, or --references and --errors, "
             "the inputs of a sound card"
         )
+    of_files = ("primary", "disturbance", "secondary", "microphones", "file_fs", "channel", "variable")
+    unused = [f"--{name.replace('_', '-')}" for name in of_files if getattr(options, name) is not None]
+    if unused:
+        raise ValueError(
+            f"{' and '.join(unused)} would not be used with a sound card: leave it out, or give a recording"
+        )
     if set(options.references) & set(options.errors):
         raise ValueError("--references and --errors must be different inputs of the sound card")
     return SoundDevice(

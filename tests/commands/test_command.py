@@ -9,8 +9,10 @@ import sys
 
 import numpy as np
 import pytest
+import scipy.signal
 from helpers.commands import FS, ROOT, SCENE, process
 
+from kfopc_filterpy import bench
 from kfopc_filterpy.signals import write_wav
 
 
@@ -116,6 +118,14 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
                 ("--rated-power 1 --ohm 8 --loudspeaker-watt 5 --impedance rising.csv", "--ohm"),
             )
         ),
+        (
+            ["run", "--references", "0", "--errors", "1", "--rated-power", "1", "--file-fs", "8000", "--channel", "0"],
+            "--file-fs and --channel would not be used with a sound card",
+        ),
+        (
+            ["explore", "noise.wav", "--primary", "P.wav", "--secondary", "untimed.npy"],
+            "untimed.npy states no sampling",
+        ),
         (["paths", "convert", "S.wav", "x.npy", "--file-fs", "8000"], "--file-fs is for files that state no rate"),
         (
             ["paths", "convert", "untimed.npy", "x.wav", "--fs", "8000"],
@@ -187,6 +197,19 @@ def test_help_says_what_it_does_and_shows_an_example(command, arguments):
     if arguments != ["paths"]:
         assert "example" in out
         assert f"  kfopc {' '.join(arguments)}".rstrip() in out
+
+
+def test_explore_takes_files_as_the_others_do_and_resamples_high_rates(command, folder, monkeypatch):
+    served = []
+    monkeypatch.setattr(bench, "serve_explore", lambda setups, port: served.extend(setups))
+    x = np.random.default_rng(0).standard_normal((2, 48000))
+    write_wav(folder / "fast.wav", x, 48000)
+    np.save(folder / "P.npy", np.eye(400)[144])
+    files = ["fast.wav:1", "--primary", "P.npy", "--secondary", "P.npy", "--file-fs", 48000]
+    assert command("explore", *files)[0] == 0
+    setup = served[0]
+    assert (setup.fs, setup.noise.size, int(np.argmax(setup.primary))) == (16000, 16000, 48)
+    np.testing.assert_array_equal(setup.noise, scipy.signal.resample_poly(x[1].astype(np.float32).astype(float), 1, 3))
 
 
 def test_help_loads_nothing_that_takes_long():

@@ -74,7 +74,7 @@ def test_a_plant_of_several_channels_is_simulated(command, tmp_path):
     np.save(tmp_path / "S.npy", paths)
     given = [str(tmp_path / "noise.wav"), "--primary", str(tmp_path / "P.wav"), "--secondary", str(tmp_path / "S.npy")]
     options = ["--rated-power", "0.03", "--taps", "24", "--block", "32", "--identify", "1.5", "--listen", "0.5"]
-    code, out, err = command("run", *given, *options, "--fs", str(FS), "--quiet")
+    code, out, err = command("run", *given, *options, "--file-fs", str(FS), "--quiet")
     assert code == 0, err
     (powers,) = re.findall(r"output power (.*)", out)
     assert powers.count("% of the rated power") == 2
