@@ -60,6 +60,8 @@ _BEGINNINGS = {
 class Recording:
     """Samples that were read from a file, with their rate and unit: of a recording, or the taps of measured paths.
 
+    Functions take it in place of an array; `simulate` and those that take paths check its rate.
+
     Attributes
     ----------
     samples : ndarray, shape (n_samples,) or (n_channels, n_samples)

@@ -69,6 +69,9 @@ def read_table(path: str | os.PathLike[str], *, n_least: int = 1) -> Table:
     columns = np.loadtxt(
         map(layout.plain, islice(_lines(path), layout.first, None)), delimiter=layout.delimiter, ndmin=2
     )
+    n_names = len(header[-1].split(",")) if header and layout.delimiter == "," else 0
+    if n_names > 1 and 2 * n_names == columns.shape[1] and not np.any(columns % 1):  # "t,p" above "0,125,0,5"
+        raise _ambiguous(path)
     if columns.shape[1] < n_least:
         raise ValueError(f"{path} must hold {n_least} columns, got {columns.shape[1]}")
     return Table(header, columns)
@@ -125,11 +128,15 @@ def _is_decimal(path: str | os.PathLike[str], names: str, lines: Iterator[str]) 
         count, before = count + 1, int(whole)
     separated = "," in names or (rises and count > 2)
     if decimal == separated:
-        raise ValueError(
-            f"{path} has a comma in each line that may separate two columns or be a decimal comma: write decimals with a "
-            "point or separate columns with a semicolon, and name the columns in the line above the numbers"
-        )
+        raise _ambiguous(path)
     return decimal
+
+
+def _ambiguous(path: str | os.PathLike[str]) -> ValueError:
+    return ValueError(
+        f"{path} has commas that may separate columns or be decimal commas: write decimals with a point or separate columns "
+        "with a semicolon, and name the columns in the line above the numbers"
+    )
 
 
 def _without_time(path: str | os.PathLike[str], table: Table) -> Content:
@@ -143,7 +150,7 @@ def _without_time(path: str | os.PathLike[str], table: Table) -> Content:
             "impulse response (or the recording) instead"
         )
     times, steps = columns[:, 0], np.diff(columns[:, 0])
-    if header and header[-1].startswith(",") and np.all(steps == 1):  # an index, which has no name
+    if header and header[-1].startswith((",", ";", "\t")) and np.all(steps == 1):  # an index, which has no name
         return Content(columns[:, 1:])
     if len(times) < 3 or not np.all(steps > 0):
         return Content(columns)

@@ -42,6 +42,7 @@ def test_a_heading_gives_the_unit_of_the_times(tmp_path, header):
     [
         (",0\n0,0.0\n1,0.0\n2,1.0\n3,0.5\n", [0, 0, 1, 0.5]),  # a Series of pandas
         (",0\n0,2048\n1,2051\n", [2048, 2051]),
+        (";0\n0;0,5\n1;1,5\n", [0.5, 1.5]),
         (",a,b\n0,2048,1\n1,2051,2\n2,2049,3\n", [[2048, 2051, 2049], [1, 2, 3]]),
         ("0,2048\n1,2051\n2,2049\n", [2048, 2051, 2049]),  # the first column counts
         ("left,right\n5,2048\n3,2051\n9,7\n", [[5, 3, 9], [2048, 2051, 7]]),
@@ -62,10 +63,10 @@ def test_commas_and_quotes_are_what_the_whole_file_says(tmp_path, text, expected
     assert read_recording(tmp_path / "x.csv", fs=8).samples.tolist() == expected
 
 
-@pytest.mark.parametrize("text", ["5,512\n3,250\n", "Level\n1,5\n2,5\n3,5\n"])
+@pytest.mark.parametrize("text", ["5,512\n3,250\n", "Level\n1,5\n2,5\n3,5\n", "t,p\n0,000,0,5\n0,125,1,5\n"])
 def test_a_comma_that_may_be_either_is_refused(tmp_path, text):
     (tmp_path / "x.csv").write_text(text)
-    with pytest.raises(ValueError, match=r"x\.csv has a comma in each line that may separate .* or be a decimal comma"):
+    with pytest.raises(ValueError, match=r"x\.csv has commas that may separate columns or be decimal commas"):
         read_recording(tmp_path / "x.csv", fs=8)
 
 
