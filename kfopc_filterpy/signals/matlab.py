@@ -29,7 +29,8 @@ _CELL, _CHAR, _SPARSE, _WITH_FIELDS = (
 _WITH_ELEMENTS = (_CELL, _CHAR, *_WITH_FIELDS)
 # Parts of a variable: flags, dimensions and name, and what its class adds. Complex numbers have one more.
 _PARTS = {**dict.fromkeys(_NUMBER_CLASSES, 4), _CELL: 3, _CHAR: 4, _SPARSE: 6, 2: 5, 3: 6}
-_MOST_VARIABLES = 10_000  # in structs and cells: each takes a hundred bytes or more in memory
+_LEADING = 8  # parts, at most, before the elements of a struct or cell
+_VARIABLE = 256  # bytes of room that a variable in a struct or cell counts for, whatever it holds
 _HEADER = 128  # bytes
 
 
@@ -140,7 +141,8 @@ def _require_honest_parts(path: str | os.PathLike[str], body: Any, order: str) -
             f"{path} is damaged: {len(body)} bytes claim to be type {kind} of {size} bytes, expected a variable"
         )
     own_class = flags & 0xFF
-    begin, end, parts, count = 8, 8 + size, [], 1
+    begin, end, count = 8, 8 + size, 1
+    parts: list[_Part] = []
     while begin + 8 <= end:
         kind, part = struct.unpack_from(f"{order}II", body, begin)
         at = begin + 8
@@ -148,18 +150,17 @@ def _require_honest_parts(path: str | os.PathLike[str], body: Any, order: str) -
             kind, part, at = kind & 0xFFFF, kind >> 16, begin + 4
         if at + part > end:
             raise ValueError(f"{path} is damaged: a part of {part} bytes in a variable of {size}")
-        parts.append(_Part(kind, body[at : at + part]))
+        if len(parts) < _LEADING:  # what follows are the elements
+            parts.append(_Part(kind, body[at : at + part]))
         if kind == _MATRIX:
             count += _require_honest_parts(path, body[begin : at + part], order) if part else 1
-            if count > _MOST_VARIABLES:
-                raise ValueError(f"{path} holds more than {_MOST_VARIABLES} variables in one: store arrays of numbers")
         begin = at + part + (-part) % 8 if at == begin + 8 else begin + 8
     needed = _PARTS.get(own_class, 3) + (own_class in (_SPARSE, *_NUMBER_CLASSES) and flags & _COMPLEX > 0)
     types, dimensions = [part.kind for part in parts], parts[1].content if len(parts) > 1 else b""
     known = _NUMBER_TYPES | (_TEXT_TYPES if own_class == _CHAR else set())
     if len(types) < needed or not set(types[:needed]) <= known or (own_class in _PARTS and len(dimensions) < 8):
         raise ValueError(
-            f"{path} is damaged: a variable has parts of the types {types[:8]}, expected {needed} with numbers"
+            f"{path} is damaged: a variable has parts of the types {types}, expected {needed} with numbers"
         )
     if own_class in _WITH_ELEMENTS:
         claimed = math.prod(parts[1].integers(order))
@@ -168,6 +169,7 @@ def _require_honest_parts(path: str | os.PathLike[str], body: Any, order: str) -
             claimed *= len(names.content) // max(1, *length.integers(order))
         if claimed > (size if own_class == _CHAR else count):
             raise ValueError(f"{path} is damaged: a struct, cell or text of {size} bytes claims {claimed} elements")
+    require_room(path, count * _VARIABLE / 8, what="its structs and cells have room for")
     return count
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import struct
 import tracemalloc
 import zipfile
 import zlib
@@ -121,20 +122,29 @@ def test_damaged_files_are_read_or_refused_with_a_message(name, originals, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("at", "what"),
+    ("name", "at", "what"),
     [
-        (b"fs\0\0\x09", b"fs\0\0\x00"),  # numbers of type 0
-        (b"\x06\0\0\0\x08\0\0\0\x06\0", b"\x06\0\0\0\x08\0\0\0\x06\x08"),  # complex, without an imaginary part
-        (b"\x06\0\0\0\x08\0\0\0\x06", b"\x06\0\0\0\x10\0\0\0\x06"),  # flags of another size
+        ("plain.mat", b"fs\0\0\x09", b"fs\0\0\x00"),  # numbers of type 0
+        # Complex, without an imaginary part.
+        ("plain.mat", b"\x06\0\0\0\x08\0\0\0\x06\0", b"\x06\0\0\0\x08\0\0\0\x06\x08"),
+        ("plain.mat", b"\x06\0\0\0\x08\0\0\0\x06", b"\x06\0\0\0\x10\0\0\0\x06"),  # flags of another size
+        # In a struct: text without dimensions, numbers of type 0; and a struct that claims 2^31 elements.
+        ("struct.mat", b"\x04\0\0\0\0\0\0\0\x05\0\0\0", b"\x04\0\0\0\0\0\0\0\x05\0\x01\0"),
+        ("struct.mat", b"\x09\0\0\0\x08\0\0\0\0\0\0\0\0\x40\xcf", b"\0\0\0\0\x08\0\0\0\0\0\0\0\0\x40\xcf"),
+        (
+            "struct.mat",
+            b"\x02\0\0\0\0\0\0\0\x05\0\0\0\x08\0\0\0\x01\0\0\0\x01\0\0\0",
+            b"\x02\0\0\0\0\0\0\0\x05\0\0\0\x08\0\0\0\0\x80\0\0\0\0\1\0",
+        ),
     ],
 )
-def test_what_the_search_found_to_end_the_process_within_scipy_is_refused(at, what, tmp_path):
-    path = tmp_path / "plain.mat"
-    WRITERS["plain.mat"](path)
+def test_what_the_search_found_to_end_the_process_within_scipy_is_refused(name, at, what, tmp_path):
+    path = tmp_path / name
+    WRITERS[name](path)
     content = path.read_bytes()
     assert at in content
     path.write_bytes(content.replace(at, what, 1))
-    with pytest.raises(ValueError, match=r"plain\.mat is damaged: "):
+    with pytest.raises(ValueError, match=rf"{name} is damaged: "):
         read_recording(path)
 
 
@@ -183,8 +193,20 @@ def _claims(path: Path, name: str) -> None:
             del file["noise"]
     elif name == "inflated.mat":
         _inflated(path)
+    elif name == "cells.mat":
+        _cells(path)
     elif name == "rew.txt":
         path.write_text(rew_text(np.ones(3), start_s=1e6))
+
+
+def _cells(path: Path) -> None:
+    """Write a cell of empty elements of eight bytes, each of which takes a hundred and more in memory."""
+    count = 300_000
+    head = struct.pack("<2I2I 2I2I 2H4s", 6, 8, 1, 0, 5, 8, count, 1, 1, 1, b"c")
+    body = struct.pack("<2I", 14, len(head) + 8 * count) + head + struct.pack("<2I", 14, 0) * count
+    WRITERS["plain.mat"](path)
+    packed = zlib.compress(body)
+    path.write_bytes(path.read_bytes()[:128] + struct.pack("<2I", 15, len(packed)) + packed)
 
 
 def _inflated(path: Path) -> None:
@@ -202,6 +224,7 @@ CLAIMS = {
     "x.flac": "claims .* samples: what takes more than 64 MiB and 100 times the file",
     "silence.flac": "claims 2e\\+07 samples",
     "packed.mat": "its compressed variables unpack to more than it may hold",
+    "cells.mat": "its structs and cells have room for 9.6e\\+06 samples",
     "x.npz": "claims 2e\\+07 samples",
     "header.npz": "claims 2e\\+07 samples",
     "x.npy": "its header claims 8000000000000 bytes of data",
