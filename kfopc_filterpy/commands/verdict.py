@@ -16,6 +16,7 @@ EXAMPLES = """examples:
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --volts-per-unit 10 --want-db 6 -o out
   kfopc verdict noise.wav --disturbance error.wav --secondary S.wav --watt 20 --ohm 8 --rating noise --json
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --fs 16000 --rated-power 1.6 --taps 256
+  kfopc verdict stereo.wav:0 --disturbance stereo.wav:1 --secondary paths.mat:S --rated-power 1.6
   cat noise.wav | kfopc verdict - --primary P.wav --secondary S.wav --rated-power 1.6
   kfopc verdict noise.wav --disturbance errors.wav --secondary S1.wav --secondary S2.wav --watt 20 --watt 10 --ohm 8
 
