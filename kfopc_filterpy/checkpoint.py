@@ -18,10 +18,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-import time
 from collections.abc import Iterable
-from contextlib import suppress
-from glob import escape
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Self
@@ -30,10 +27,10 @@ import numpy as np
 
 from . import _pickles
 from ._pickles import LINE
+from ._writing import replacing
 
 FORMAT = 2
 DIGEST = 64  # hexadecimal digits of SHA-256
-ABANDONED_S = 3600.0  # an unfinished file as old as this belongs to a process that was killed
 
 
 class CheckpointError(ValueError):
@@ -83,7 +80,10 @@ class Checkpointed:
         >>> again.control_signal(1.0) == controller.control_signal(1.0)
         True
         """
-        _write(Path(os.path.realpath(path)), _content(self))
+        content = _content(self)
+        with replacing(path) as file:
+            file.write(content)
+            file.write(hashlib.sha256(content).hexdigest().encode())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, trusted: Iterable[Any] = ()) -> Self:
@@ -140,33 +140,6 @@ def _content(value: Any) -> bytes:
     pickled, arrays = _pickles.pickled(value)
     first = f"{_kind()}{len(pickled)}\n".encode()
     return b"".join((first, pickled, bytes(-(len(first) + len(pickled)) % LINE), arrays))
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Write a file with its checksum, so that `path` has either its old content or all of the new one."""
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"the folder {path.parent} does not exist: make it first")
-    for left in path.parent.glob(f".{escape(path.name)}.*.part"):  # by a process that was killed
-        with suppress(FileNotFoundError):
-            if time.time() - left.stat().st_mtime > ABANDONED_S:
-                left.unlink()
-    part = path.with_name(f".{path.name}.{os.urandom(8).hex()}.part")
-    try:
-        with open(part, "xb") as file:
-            file.write(content)
-            file.write(hashlib.sha256(content).hexdigest().encode())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
-    if os.name != "nt":  # Windows does not open folders
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # the new name is on the disk too
-        finally:
-            os.close(folder)
 
 
 def _load(kind: type[Any], path: Path, trusted: Iterable[Any]) -> Any:

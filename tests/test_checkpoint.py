@@ -504,7 +504,7 @@ def test_what_killed_processes_left_is_removed_after_an_hour(tmp_path: Path) -> 
 KILLED = """
 import os, signal, sys
 import numpy as np
-from kfopc_filterpy import KFOPC, checkpoint
+from kfopc_filterpy import KFOPC, _writing, checkpoint
 
 path = sys.argv[1]
 
@@ -514,7 +514,7 @@ def save_until(kf, pipe, kill_at):
 
     def trace(frame, event, argument):
         nonlocal lines
-        if frame.f_code.co_filename == checkpoint.__file__ and event == "line":
+        if frame.f_code.co_filename in (checkpoint.__file__, _writing.__file__) and event == "line":
             lines += 1
             if lines == kill_at:
                 os.kill(os.getpid(), signal.SIGKILL)

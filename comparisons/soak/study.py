@@ -27,6 +27,7 @@ from scipy.signal import butter, lfilter, sosfilt, unit_impulse
 
 import kfopc_filterpy as anc
 from kfopc_filterpy import OutputLimiter, simulate
+from kfopc_filterpy.bench import write_whole
 from kfopc_filterpy.bench.report import aligned
 
 SAMPLES = 10_000_000
@@ -438,7 +439,7 @@ def main(arguments: Sequence[str]) -> int:
             for case, signal in runs:
                 bar.set_description(f"{case.name}, {signal}")
                 outcomes.append(soak(case, signal, round(samples * case.share), bar.update))
-                written.write_text(json.dumps([asdict(one) for one in outcomes], indent=1) + "\n")
+                write_whole(written, json.dumps([asdict(one) for one in outcomes], indent=1) + "\n")
         except KeyboardInterrupt:
             print(f"interrupted after {len(outcomes)} of {len(runs)} runs")
     if not outcomes:

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kfopc_filterpy import KFOPC
+from kfopc_filterpy._writing import replacing
+from kfopc_filterpy.bench import write_whole
 
 from . import variants
 from .beside_filterpy import table_beside_filterpy, times_beside_filterpy
@@ -311,8 +313,9 @@ def main(folder: Path, quiet: bool = False) -> int:
             others[name] = work()
             bar.update()
     result = {"dgemm_gflops": max(rates), "rows": rows, "worst_sample": worst} | others
-    (folder / "speed.json").write_text(json.dumps(result, indent=1) + "\n")
-    figure(result).savefig(folder / "speed.png", dpi=150)
+    write_whole(folder / "speed.json", json.dumps(result, indent=1) + "\n")
+    with replacing(folder / "speed.png") as file:
+        figure(result).savefig(file, dpi=150)
     print(
         table(result),
         channel_table(others["channels"]),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import t as student
 
+from kfopc_filterpy._writing import replacing
 from kfopc_filterpy.bench import write_whole
 from kfopc_filterpy.plot import curve_style
 
@@ -95,7 +96,8 @@ def write_table(rows: Sequence[Record], path_without_suffix: Path, kind: str) ->
         from pyarrow import csv as pyarrow_csv
         from pyarrow import parquet
 
-        parquet.write_table(pyarrow_csv.read_csv(io.BytesIO(text.getvalue().encode())), path)
+        with replacing(path) as file:
+            parquet.write_table(pyarrow_csv.read_csv(io.BytesIO(text.getvalue().encode())), file)
     return path
 
 

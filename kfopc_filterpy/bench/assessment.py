@@ -35,6 +35,7 @@ from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.bounds import SuggestedSettings
 from kfopc_filterpy.controllers.base import listed
 
+from .._writing import replacing_files
 from .._types import NumberOrArray
 from .fixed_filters import longest_filter
 from .limits import Limits
@@ -298,6 +299,7 @@ class Assessment:
         """Write verdict.html, verdict.json, figures and sounds into a `folder`, and return the path of the page.
 
         The page needs no other file. All sounds have one scale: what is louder in a file is louder at the microphone.
+        Files of the same names are replaced, all of them or none, and others stay.
 
         Raises
         ------
@@ -307,8 +309,11 @@ class Assessment:
             A library of the extra `studies` is missing.
         """
         from .assessment_page import write_assessment
+        from .report import prepare_folder
 
-        return write_assessment(self, folder)
+        path = prepare_folder(folder)
+        with replacing_files(path) as new:
+            return path / write_assessment(self, new).name
 
     @property
     def json(self) -> str:

@@ -6,11 +6,11 @@ import csv
 import io
 import json
 import os
-import tempfile
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
+from kfopc_filterpy._writing import replacing, replacing_files, require_writable
 from kfopc_filterpy.plot import save_figure
 from kfopc_filterpy.signals import write_wav
 
@@ -50,8 +50,7 @@ def prepare_folder(folder: str | os.PathLike[str]) -> Path:
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
+        require_writable(path)
     except OSError as error:
         raise OSError(f"folder {str(path)!r} cannot be written ({error}); choose another output folder") from error
     return path
@@ -65,7 +64,7 @@ def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str])
     studies : sequence of StudyReport
         The studies, in their order.
     folder : path
-        Where to write; files of the same names are replaced, others stay.
+        Where to write; files of the same names are replaced, all of them or none, and others stay.
 
     Returns
     -------
@@ -94,14 +93,14 @@ def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str])
     results = json.dumps(
         {"studies": {study.name: study.result for study in studies}}, allow_nan=False, ensure_ascii=False, indent=2
     )
-    path = prepare_folder(folder)
-    lead = glance(studies)
-    if lead is not None:
-        save_figure(lead.figure, path / "figures" / lead.stem)
-    for study in studies:
-        write_files(study, path)
-    write_whole(path / "results.json", results + "\n")
-    write_whole(path / "report.html", page(studies, path, lead))
+    path, lead = prepare_folder(folder), glance(studies)
+    with replacing_files(path) as new:
+        if lead is not None:
+            save_figure(lead.figure, new / "figures" / lead.stem)
+        for study in studies:
+            write_files(study, new)
+        write_whole(new / "results.json", results + "\n")
+        write_whole(new / "report.html", page(studies, new, lead))
     return path / "report.html"
 
 
@@ -218,9 +217,5 @@ def write_whole(path: Path, text: str) -> None:
     ...     print((Path(folder) / "note.txt").read_text())
     done
     """
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with replacing(path) as file:
+        file.write(text.encode())

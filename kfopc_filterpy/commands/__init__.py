@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{options.prog}: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
         return WRONG_INPUT
     except KeyboardInterrupt:
-        print(f"{options.prog}: interrupted; nothing was written", file=sys.stderr)
+        print(f"{options.prog}: interrupted; each file is as it was, or was written whole", file=sys.stderr)
         return 130
 
 

@@ -7,8 +7,8 @@ import json
 
 from .._validate import as_choice
 from .inputs import Files, ratings_of, scene_of
-from .options import DONE, Parser, add_command, add_count, add_number, add_output, add_recorded_scene
-from .printing import progress_bar, tell
+from .options import DONE, Parser, add_command, add_count, add_number, add_output, add_recorded_scene, prepare_output
+from .printing import progress_bar, say_written, tell
 
 EXAMPLES = """example:
   kfopc compare noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --algorithm KF-PB,KF-OPC,FxLMS -o out"""
@@ -30,11 +30,9 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
 
 def compare(options: argparse.Namespace) -> int:
     """Print figures of merit, and write the report if a folder is given."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     from ..bench import algorithms, compare_recordings, results_table, write_report
 
+    prepare_output(options)
     files = Files(options)
     noise, primary, secondary, disturbance = scene_of(options, files)
     several = (len(noise), *secondary.shape[:2]) != (1, 1, 1)
@@ -56,10 +54,9 @@ def compare(options: argparse.Namespace) -> int:
             bar=bar,
         )
     report.notes.extend(files.remarks)
-    written = None
-    if options.output is not None:
-        written = f"{write_report([report], options.output)} and results.json"
     text = results_table([report]).rstrip()
     result = json.dumps(report.result, indent=2, allow_nan=False) if options.json else text
-    tell(options, result, report.notes, written)
+    tell(options, result, report.notes)
+    if options.output is not None:
+        say_written(options, write_report([report], options.output), "results.json")
     return DONE

@@ -119,6 +119,19 @@ def add_recorded_scene(parser: argparse._ActionsContainer) -> None:
     rating.add_argument("--displacement", metavar="CSV", help=about, **each)
 
 
+def prepare_output(options: argparse.Namespace) -> None:
+    """Raise an error if the folder, or the page in it, cannot be written: better before the run than after it."""
+    import matplotlib
+
+    from ..bench.assessment_page import require_page
+    from ..bench.report import prepare_folder
+
+    matplotlib.use("Agg")
+    if options.output is not None:
+        require_page()
+        prepare_folder(options.output)
+
+
 def add_output(parser: argparse._ActionsContainer, about: str, about_json: str) -> None:
     """Add the options for what is written and printed."""
     parser.add_argument("-o", "--output", metavar="FOLDER", help=about)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import math
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .._writing import replacing, require_writable
 from .inputs import Files
 from .options import DONE, Parser, add_command, add_count, add_reading, sentence
 from .printing import warn
@@ -64,6 +66,7 @@ def identify(options: argparse.Namespace) -> int:
     """Fit an impulse response, write it and print what it leaves unexplained."""
     from ..paths import estimate_path
 
+    _require_output(options.output)
     files = Files(options)
     sent, heard = files.recording(options.excitation), files.recording(options.response)
     shortest = min(sent.size, heard.size)  # a recorder is stopped later than the player
@@ -175,11 +178,19 @@ def convert(options: argparse.Namespace) -> int:
     if (options.to is None) == (options.output is None):
         raise ValueError(f"one file to write is needed, for example {options.path} S.csv or {options.path} -o S.csv")
     output = options.to if options.to is not None else options.output
+    _require_output(output)
     files = Files(options)
     taps = files.path(options.path)
     _write_path(output, taps, files.fs)
     print(f"{output}: {taps.size} taps at {files.fs:g} Hz")
     return DONE
+
+
+def _require_output(output: str) -> None:
+    """Raise ValueError or OSError if a path cannot be written: better before it is made than after."""
+    if Path(output).suffix.lower() not in WRITTEN:
+        raise ValueError(f"{output} must end in {', '.join(WRITTEN)}")
+    require_writable(Path(output).parent)
 
 
 def _write_path(output: str, taps: np.ndarray, fs: float) -> None:
@@ -193,13 +204,15 @@ def _write_path(output: str, taps: np.ndarray, fs: float) -> None:
                 f"{output} must have a rate of whole Hz, as WAV files have, got {fs:g} Hz: take another --fs, or write .csv"
             )
         write_wav(output, taps, fs)
-    elif suffix == ".npy":
-        np.save(output, taps)
-    elif suffix in (".csv", ".txt"):
-        times = np.arange(taps.size) / fs
-        np.savetxt(output, np.column_stack([times, taps]), delimiter="," if suffix == ".csv" else "\t", fmt="%.17g")
-    else:
-        raise ValueError(f"{output} must end in {', '.join(WRITTEN)}")
+        return
+    with replacing(output) as file:
+        if suffix == ".npy":
+            content = io.BytesIO()  # in a file, numpy would not notice that the disk is full
+            np.save(content, taps)
+            file.write(content.getbuffer())
+        else:
+            timed = np.column_stack([np.arange(taps.size) / fs, taps])
+            np.savetxt(file, timed, delimiter="," if suffix == ".csv" else "\t", fmt="%.17g")
 
 
 def plot(options: argparse.Namespace) -> int:
@@ -212,12 +225,15 @@ def plot(options: argparse.Namespace) -> int:
     from ..plot import plot_bode, plot_impulse_responses
 
     files = Files(options)
-    taps = {Path(name).stem: files.path(name) for name in options.path}
+    stems = [Path(name).stem for name in options.path]
+    labels = [stem if stems.count(stem) == 1 else name for stem, name in zip(stems, options.path, strict=True)]
+    taps = {label: files.path(name) for label, name in zip(labels, options.path, strict=True)}
     figure, axes = plt.subplots(3, 1, figsize=(7, 8), layout="constrained")
     plot_impulse_responses(taps, fs=files.fs, ax=axes[0])
     plot_bode(taps, fs=files.fs, ax=axes[1:])
     output = Path(options.output)
     output = output if output.suffix else output.with_suffix(".png")
-    figure.savefig(output, dpi=160)
+    with replacing(output) as file:
+        figure.savefig(file, format=output.suffix[1:], dpi=160)
     print(f"{output} written")
     return DONE

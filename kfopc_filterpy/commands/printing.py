@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 EXTRA = 'install the extra `studies`: python -m pip install "kfopc-filterpy[studies]"'
@@ -16,13 +17,17 @@ def warn(options: argparse.Namespace, message: str, kind: str = "warning") -> No
     print(f"{options.prog}: {kind}: {message}", file=sys.stderr)
 
 
-def tell(options: argparse.Namespace, result: str, notes: Sequence[str], written: str | None) -> None:
-    """Print a result, notes on it, and which files were written."""
-    print(result)
+def tell(options: argparse.Namespace, result: str, notes: Sequence[str]) -> None:
+    """Print a result, before its files are written, and notes on it."""
+    print(result, flush=True)
     for note in notes:
         warn(options, note, "note")
-    if written and not options.json:
-        print(f"{written} written")
+
+
+def say_written(options: argparse.Namespace, page: Path, beside: str) -> None:
+    """Print which files were written."""
+    if not options.json:
+        print(f"{page} and {beside} written")
 
 
 @contextmanager

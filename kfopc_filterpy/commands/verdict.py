@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from .._validate import as_choice, as_nonnegative, as_number
 from .inputs import Files, calibration_of, ratings_of, scene_of, uncertainty_of
-from .options import DONE, Parser, add_command, add_count, add_number, add_output, add_recorded_scene
-from .printing import progress_bar, tell
+from .options import DONE, Parser, add_command, add_count, add_number, add_output, add_recorded_scene, prepare_output
+from .printing import progress_bar, say_written, tell
 
 NOT_ENOUGH = 1
 
@@ -61,19 +61,12 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
 
 def verdict(options: argparse.Namespace) -> int:
     """Print a verdict, and write its page if a folder is given."""
-    if options.output is not None:  # errors come before the run, not after it
-        import matplotlib
-
-        from ..bench.assessment_page import require_page
-        from ..bench.report import prepare_folder
-
-        matplotlib.use("Agg")
-        require_page()
-        prepare_folder(options.output)
     from ..bench import assess
     from ..bench.assessed_runs import ALGORITHMS
     from ..bench.assessment import advice_on
 
+    if options.output is not None:
+        prepare_output(options)
     as_choice(options.algorithm, "--algorithm", ALGORITHMS)
     files = Files(options)
     noise, primary, secondary, disturbance = scene_of(options, files)
@@ -96,9 +89,7 @@ def verdict(options: argparse.Namespace) -> int:
         )
         advice = advice_on(found, fs="--fs ", n_taps="--taps ")
         found = replace(found, advice=tuple(advice), notes=(*found.notes, *files.remarks))
-        written = None
-        if options.output is not None:
-            bar.set_description("page")
-            written = f"{found.write(options.output)} and verdict.json"
-    tell(options, found.json if options.json else str(found), found.notes, written)
+    tell(options, found.json if options.json else str(found), found.notes)
+    if options.output is not None:
+        say_written(options, found.write(options.output), "verdict.json")
     return DONE if found.enough else NOT_ENOUGH

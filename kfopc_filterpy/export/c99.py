@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike
 
+from .._writing import replacing_files
 from ..controllers.base import calls_of
 from ..controllers.core_controller import CoreController
 from ..core.block import Block
@@ -154,8 +155,9 @@ def export_c(
     if in_folder:
         texts |= exported.examples()
         path.parent.mkdir(parents=True, exist_ok=True)
-    for file, text in texts.items():
-        (path.parent / file).write_text(text, encoding="utf-8", newline="\n")
+    with replacing_files(path.parent) as folder:
+        for file, text in texts.items():
+            (folder / file).write_text(text, encoding="utf-8", newline="\n")
     precision = exported.block.algorithm.precision
     return CExport(path, header, name, controller.name, controller.n_taps, precision.name, exported.n_bytes)
 

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, as_signal
+from .._writing import replacing
 from ..metrics import nse_db, short_time_power
 from .results import DISTURBANCE, RATED, Curve, Results, curves, named_styles, one_channel, thinned
 from .style import legend_above, new_axes
@@ -411,8 +412,10 @@ def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> 
     path.parent.mkdir(parents=True, exist_ok=True)
     png, svg = (path.with_name(path.name + suffix) for suffix in (".png", ".svg"))
     with mpl.rc_context({"svg.hashsalt": "kfopc_filterpy"}):
-        figure.savefig(png, dpi=160)
-        figure.savefig(svg, metadata={"Date": None})
+        with replacing(png) as file:
+            figure.savefig(file, format="png", dpi=160)
+        with replacing(svg) as file:
+            figure.savefig(file, format="svg", metadata={"Date": None})
     plt.close(figure)
     return png, svg
 

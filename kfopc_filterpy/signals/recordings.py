@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_channels, as_count, as_number, as_positive, as_rate_ratio, as_real_array, require_finite
+from .._writing import replacing
 from .arrays import read_npy, read_npz
 from .audio import read_audio
 from .content import Content, channels_first, reading, require_file, require_room
@@ -430,15 +431,16 @@ def write_wav(path: str | os.PathLike[str], signal: ArrayLike, fs: float, *, pea
     if rate != round(rate):
         raise ValueError(f"fs must be a whole number of Hz in a WAV file, got {rate:g} Hz")
     if peak is None:
-        wavfile.write(path, round(rate), samples.T.astype(np.float32))
-        return
-    full_scale = as_positive(peak, "peak")
-    largest = np.max(np.abs(samples))
-    if largest > full_scale:
-        raise ValueError(
-            f"signal reaches {largest:g}, beyond peak = {full_scale:g}; raise peak, or limit the signal with np.clip"
-        )
-    wavfile.write(path, round(rate), np.round(samples.T / full_scale * 32767).astype(np.int16))
+        frames = samples.T.astype(np.float32)
+    else:
+        full_scale, largest = as_positive(peak, "peak"), np.max(np.abs(samples))
+        if largest > full_scale:
+            raise ValueError(
+                f"signal reaches {largest:g}, beyond peak = {full_scale:g}; raise peak, or limit the signal with np.clip"
+            )
+        frames = np.round(samples.T / full_scale * 32767).astype(np.int16)
+    with replacing(path) as file:
+        wavfile.write(file, round(rate), frames)
 
 
 def _silent_tail(signal: Any) -> np.ndarray:

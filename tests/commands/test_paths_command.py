@@ -126,6 +126,24 @@ def test_a_path_is_inspected_and_plotted(command, tmp_path):
     assert (tmp_path / "plots.png").is_file()
 
 
+def test_paths_of_one_name_in_two_folders_are_both_drawn(command, tmp_path):
+    for folder, at in (("a", 12), ("b", 15)):
+        (tmp_path / folder).mkdir()
+        write_wav(tmp_path / folder / "S.wav", np.eye(64)[at], FS)
+    paths = [tmp_path / folder / "S.wav" for folder in ("a", "b")]
+    assert command("paths", "plot", *paths, "P.wav", "-o", tmp_path / "paths.svg")[0] == 0
+    drawn = (tmp_path / "paths.svg").read_text()
+    assert all(f"<!-- {label} -->" in drawn for label in (*paths, "P"))
+
+
+@pytest.mark.parametrize("output", ["no/S.wav", "S.mp3"])
+def test_a_path_that_could_not_be_written_is_refused_before_it_is_made(command, output):
+    code, _, err = command("paths", "identify", "missing.wav", "missing.wav", "--taps", 8, "-o", output)
+    assert code == 2
+    assert output.split("/")[0] in err
+    assert "missing.wav" not in err
+
+
 def test_a_matrix_of_paths_is_inspected(command, several, tmp_path):
     _, primary, secondary = several
     secondary = secondary.copy()

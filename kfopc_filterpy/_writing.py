@@ -1,0 +1,128 @@
+"""Files that are written whole: beside their place, forced to the disk, and then renamed.
+
+So the disk may be full, the process killed or a file written onto its own source: what was there before stays, or all of
+the new is there. Files that belong together change together.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from glob import escape
+from pathlib import Path
+from typing import BinaryIO
+
+ABANDONED_S = 3600.0  # what is unfinished and as old as this belongs to a process that was killed
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Yield a file beside `path`. It takes that name when the block ends; if the block raises, it is removed."""
+    place = Path(os.path.realpath(path))  # a link stays a link
+    if not place.parent.is_dir():
+        raise FileNotFoundError(f"the folder {place.parent} does not exist: make it first")
+    if place.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: name a file in it")
+    _remove_abandoned(place.parent, place.name)
+    part = place.with_name(f".{place.name}.{os.urandom(8).hex()}.part")
+    try:
+        with open(part, "xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        if place.exists():
+            shutil.copymode(place, part)
+        os.replace(part, place)
+    except BaseException as error:
+        part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, str(part)):
+            error.filename = str(path)
+        raise
+    if os.name != "nt":  # Windows does not open folders
+        with _opened(place.parent) as folder:
+            os.fsync(folder)  # the new name is on the disk too
+
+
+@contextmanager
+def replacing_files(folder: Path) -> Iterator[Path]:
+    """Yield an empty folder. When the block ends, its files take the same places in `folder`, all of them or none.
+
+    Other files of `folder` stay. A second process that writes there waits for this one, except on Windows. If the process
+    is killed among the renames, which take milliseconds, then the files at the top of `folder` are missing, because
+    they go first and come last: no page stands beside sounds of another run.
+    """
+    _remove_abandoned(folder, "files")
+    made = Path(tempfile.mkdtemp(prefix=".files.", suffix=".part", dir=folder))
+    try:
+        new = made / "new"
+        new.mkdir()
+        yield new
+        with _locked(folder):
+            _exchange(new, folder, made / "old")
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _exchange(new: Path, folder: Path, old: Path) -> None:
+    """Move the files of `new` to the same places in `folder`, and what they replace to `old`."""
+    names = [path.relative_to(new) for path in new.rglob("*") if not path.is_dir()]
+    names.sort(key=lambda name: (len(name.parts), name))
+    try:
+        for name in names:
+            if (folder / name).is_file():
+                _move(folder / name, old / name)
+        for name in reversed(names):
+            _move(new / name, folder / name)
+    except BaseException:
+        for name in names:
+            if (old / name).exists():
+                os.replace(old / name, folder / name)
+            elif not (new / name).exists():
+                (folder / name).unlink()
+        raise
+
+
+def require_writable(folder: str | os.PathLike[str]) -> None:
+    """Raise OSError if no file can be written in a folder."""
+    with tempfile.TemporaryFile(dir=folder):
+        pass
+
+
+def _move(path: Path, to: Path) -> None:
+    to.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(path, to)
+
+
+def _remove_abandoned(folder: Path, name: str) -> None:
+    for left in folder.glob(f".{escape(name)}.*.part"):
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime > ABANDONED_S:
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
+
+
+@contextmanager
+def _opened(folder: Path) -> Iterator[int]:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes from changing the files of a folder; where there are no such locks, do nothing."""
+    if sys.platform == "win32":
+        yield
+        return
+    from fcntl import LOCK_EX, flock
+
+    with _opened(folder) as descriptor:
+        with suppress(OSError):  # a file system without locks
+            flock(descriptor, LOCK_EX)
+        yield
