@@ -122,14 +122,16 @@ def test_files_that_belong_together_are_all_old_or_all_new_at_whatever_line_thei
     seen, line, interrupted = [0, 0], 0, True
     while interrupted:
         line += 1
-        export_c(controllers[0], tmp_path / "anc.c")
+        folder = tmp_path / str(line)
+        folder.mkdir()
+        export_c(controllers[0], folder / "anc.c")
         try:
             with interrupt_at(line):
-                export_c(controllers[1], tmp_path / "anc.c")
+                export_c(controllers[1], folder / "anc.c")
             interrupted = False
         except KeyboardInterrupt:
             pass
-        left = {name: content for name, content in contents(tmp_path).items() if name[0] != "."}
+        left = {name: content for name, content in contents(folder).items() if name[0] != "."}
         assert left in whole, line
         seen[whole.index(left)] += 1
     assert min(seen) >= 1
@@ -140,7 +142,7 @@ WRITE = """
 import sys
 sys.path[:0] = sys.argv[1:3]
 from test_writing import report, write_report
-for _ in range(30):
+for _ in range(12):
     write_report([report(sys.argv[4])], sys.argv[3])
 """
 

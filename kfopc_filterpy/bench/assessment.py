@@ -35,8 +35,8 @@ from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.bounds import SuggestedSettings
 from kfopc_filterpy.controllers.base import listed
 
-from .._writing import replacing_files
 from .._types import NumberOrArray
+from .._writing import replacing_files
 from .fixed_filters import longest_filter
 from .limits import Limits
 from .study_report import jsonable

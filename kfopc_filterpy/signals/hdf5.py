@@ -1,4 +1,4 @@
-"""HDF5 files: MATLAB's version 7.3, and SOFA."""
+"""HDF5 files: MATLAB's version 7.3, and SOFA. They are read in a process of their own, see `child`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .child import read_in_child
 from .content import Content, chosen_variable, optional_module, require_room
 
 NUMERIC_CLASSES = (
@@ -22,7 +23,19 @@ _DEFLATE, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # filters of HDF5 that neither run fo
 
 
 def read_mat73(path: str | os.PathLike[str], variable: str | None) -> Content:
-    """Return one variable of a MATLAB file of version 7.3.
+    """Return one variable of a MATLAB file of version 7.3."""
+    _h5py(path)
+    return read_in_child(read_mat73_here, path, variable)
+
+
+def read_sofa(path: str | os.PathLike[str]) -> Content:
+    """Return the impulse responses of a SOFA file (AES69), (receivers, sources, n_taps), with their delays."""
+    _h5py(path)
+    return read_in_child(read_sofa_here, path)
+
+
+def read_mat73_here(path: str | os.PathLike[str], variable: str | None) -> Content:
+    """Return what `read_mat73` does, in this process.
 
     h5py and not pymatreader: it tells shapes and types before it reads, so that a file cannot claim the memory, and it
     needs nothing else.
@@ -54,8 +67,8 @@ def read_mat73(path: str | os.PathLike[str], variable: str | None) -> Content:
         )
 
 
-def read_sofa(path: str | os.PathLike[str]) -> Content:
-    """Return the impulse responses of a SOFA file (AES69), (receivers, sources, n_taps), with their delays."""
+def read_sofa_here(path: str | os.PathLike[str]) -> Content:
+    """Return what `read_sofa` does, in this process."""
     with _h5py(path).File(path, "r") as file:
         kind = _text(file.attrs.get("DataType"))
         if _text(file.attrs.get("Conventions")) != "SOFA" or kind not in ("FIR", "FIR-E"):

@@ -15,11 +15,10 @@ TESTS = Path(__file__).parents[1]
 sys.path[:0] = [str(TESTS.parent), str(TESTS), str(TESTS / "signals")]
 
 with atheris.instrument_imports(include=["kfopc_filterpy.paths", "kfopc_filterpy.signals", "pyuff"]):
+    import pyuff  # noqa: F401  instrumented too, where its reader imports it
     from helpers.files import WRITERS
     from test_damaged_files import check, outcome
 
-    import kfopc_filterpy.signals.recordings
-    import pyuff  # noqa: F401  instrumented too, where its reader imports it
     from kfopc_filterpy.paths import read_path
     from kfopc_filterpy.signals import read_recording
 
