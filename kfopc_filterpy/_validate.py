@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-_LARGEST_DENOMINATOR = 50_000  # of a ratio of sampling rates
+_LARGEST_OF_RATIO = 50_000  # of the whole numbers of a ratio of sampling rates
+_LOWEST_RATE, _HIGHEST_RATE = 1e-3, 1e9  # Hz; others are not sampling rates of signals
 
 
 def as_signal(value: Any, name: str, *, min_length: int = 1, length: int | None = None) -> np.ndarray:
@@ -116,6 +117,14 @@ def as_positive(value: Any, name: str, *, unit: str = "") -> float:
     return number
 
 
+def as_rate(value: Any, name: str) -> float:
+    """Return `value` as a sampling rate in Hz of a recorded signal."""
+    rate = as_positive(value, name, unit="Hz")
+    if not _LOWEST_RATE <= rate <= _HIGHEST_RATE:
+        raise ValueError(f"{name} must be a sampling rate from {_LOWEST_RATE:g} to {_HIGHEST_RATE:g} Hz, got {rate:g} Hz")
+    return rate
+
+
 def per_loudspeaker(
     value: Any, n_loudspeakers: int, name: str, check: Callable[[Any, str], float] = as_positive
 ) -> np.ndarray:
@@ -175,10 +184,11 @@ def as_band(band: Any, fs: float, name: str = "band") -> tuple[float, float]:
 
 def as_rate_ratio(fs: float, new_fs: float) -> tuple[int, int]:
     """Return `new_fs / fs` as a ratio (up, down) of whole numbers."""
-    ratio = Fraction(new_fs / fs).limit_denominator(_LARGEST_DENOMINATOR)
-    if not ratio or abs(fs * ratio - new_fs) > 1e-12 * new_fs:  # an irrational ratio comes within 2e-10
+    ratio = Fraction(new_fs / fs).limit_denominator(_LARGEST_OF_RATIO)
+    # An irrational ratio comes within 2e-10.
+    if not 0 < ratio <= _LARGEST_OF_RATIO or abs(fs * ratio - new_fs) > 1e-12 * new_fs:
         raise ValueError(
-            f"sample rates must be in a ratio of whole numbers up to {_LARGEST_DENOMINATOR}, got {fs:g} and {new_fs:g} Hz; "
+            f"sample rates must be in a ratio of whole numbers up to {_LARGEST_OF_RATIO}, got {fs:g} and {new_fs:g} Hz; "
             "round them to whole Hz"
         )
     return ratio.numerator, ratio.denominator

@@ -25,7 +25,7 @@ from .._validate import (
 )
 from ..power.amplifiers import amplifier_of_each
 from .analysis import responses_of_both
-from .least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve
+from .least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve, ridge_solve
 from .models import fir_path, path_taps, sampling_rate
 from .path_matrix import SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 from .uncertainty import relative_to
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 SEGMENT = 512  # samples of a segment of the spectra; its frequencies are those of `path_uncertainty`
 CORRELATED = 1.3  # times what chance gives: a residual is correlated with the excitation
+_MOST_DENSE = 2048  # weights; of more, an iteration is faster and takes less memory
 CONFIDENCE = 2.5  # standard deviations; a complex Gaussian error exceeds them at 0.2 % of the frequencies
 
 # Excitations at once whose correlation coefficient exceeds this at some delay count as the same signal.
@@ -230,16 +231,19 @@ def fit_paths(
     """
     from scipy.linalg import cho_factor, cho_solve
 
-    matrix = correlation_matrix(sent, n_taps)
-    for j, signal in enumerate(sent):
-        diagonal = np.arange(j * n_taps, (j + 1) * n_taps)
-        matrix[diagonal, diagonal] += regularization * float(np.mean(signal[n_taps - 1 :] ** 2))
     settled = heard[:, n_taps - 1 :]
     right = np.array([np.concatenate([cross_correlation(k, signal) for signal in sent]) for k in settled])
-    if len(sent) > 1 and regularization > RANK_TOLERANCE:  # positive definite: Cholesky's method saves most of the time
-        fitted = cho_solve(cho_factor(matrix), right.T).T
+    ridges = regularization * np.mean(sent[:, n_taps - 1 :] ** 2, axis=1)
+    is_definite = regularization > RANK_TOLERANCE
+    if is_definite and right.shape[1] > _MOST_DENSE:
+        fitted = ridge_solve(sent, right, ridges)
     else:
-        fitted = minimum_norm_solve(matrix, right)
+        matrix = correlation_matrix(sent, n_taps)
+        matrix[np.diag_indices_from(matrix)] += np.repeat(ridges, n_taps)
+        if len(sent) > 1 and is_definite:  # Cholesky's method saves most of the time
+            fitted = cho_solve(cho_factor(matrix), right.T).T
+        else:
+            fitted = minimum_norm_solve(matrix, right)
     taps = fitted.reshape(len(heard), len(sent), n_taps)
     left = settled - [
         sum(np.convolve(signal, path, mode="valid") for signal, path in zip(sent, paths, strict=True)) for paths in taps

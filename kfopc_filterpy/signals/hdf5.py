@@ -19,6 +19,7 @@ NUMERIC_CLASSES = (
     *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
 )
 _STRUCT = "a struct"
+_CHUNK_COST = 4096  # bytes that HDF5 takes for a chunk, however small it is
 _DEFLATE, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # filters of HDF5 that neither run foreign code nor expand twice
 
 
@@ -153,6 +154,8 @@ def _require_honest_chunks(path: str | os.PathLike[str], data: Any) -> None:
         )
     room = math.prod(data.chunks) * data.dtype.itemsize
     require_room(path, room / 8)
+    n_chunks = math.prod(-(-size // chunk) for size, chunk in zip(data.shape, data.chunks, strict=True))
+    require_room(path, n_chunks * _CHUNK_COST / 8, what=f"its {n_chunks} chunks take as much memory as")
     for index in range(data.id.get_num_chunks()) if _DEFLATE in filters else ():
         _, raw = data.id.read_direct_chunk(data.id.get_chunk_info(index).chunk_offset)
         if len(zlib.decompressobj().decompress(raw, room + 5)) > room + 4:  # Fletcher's checksum has 4 bytes

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validate import as_channels, as_count, as_number, as_positive, as_rate_ratio, as_real_array, require_finite
+from .._validate import as_channels, as_count, as_number, as_positive, as_rate, as_rate_ratio, as_real_array, require_finite
 from .._writing import replacing
 from .arrays import read_npy, read_npz
 from .audio import read_audio
@@ -102,9 +102,9 @@ class Recording:
         else:
             samples = as_channels(samples, name)
         object.__setattr__(self, "samples", samples)
-        object.__setattr__(self, "fs", as_positive(self.fs, "fs", unit="Hz"))
+        object.__setattr__(self, "fs", as_rate(self.fs, "fs"))
         if self.file_fs is not None:
-            object.__setattr__(self, "file_fs", as_positive(self.file_fs, "file_fs", unit="Hz"))
+            object.__setattr__(self, "file_fs", as_rate(self.file_fs, "file_fs"))
 
     def one_channel(self) -> np.ndarray:
         """Return the samples of the only channel, (n_samples,).
@@ -310,8 +310,8 @@ def read_content(path: str | os.PathLike[str], *, channel: int | None = None, va
         raise ValueError(f"{path} is {kind}, which has no named variables: leave out the option variable")
     with reading(path, kind):
         content = _NAMED[kind](path, variable) if kind in _NAMED else _UNNAMED[kind](path)
-    if content.fs is not None and not (math.isfinite(content.fs) and content.fs > 0):
-        raise ValueError(f"{path} states a sampling rate of {content.fs:g} Hz, expected one above 0")
+    if content.fs is not None:
+        as_rate(content.fs, f"the rate that {path} states")
     if (
         content.samples.ndim == 3
         and kind != "a SOFA file"
@@ -359,8 +359,8 @@ def rates_of(
     path: str | os.PathLike[str], content: Content, fs: float | None, file_fs: float | None
 ) -> tuple[float, float]:
     """Return the rate of a file, and the rate wanted, in Hz."""
-    wanted = None if fs is None else as_positive(fs, "fs", unit="Hz")
-    given = None if file_fs is None else as_positive(file_fs, "file_fs", unit="Hz")
+    wanted = None if fs is None else as_rate(fs, "fs")
+    given = None if file_fs is None else as_rate(file_fs, "file_fs")
     if content.fs is not None and given is not None and given != content.fs:
         raise ValueError(
             f"{path} states a sampling rate of {content.fs:g} Hz, but file_fs = {given:g} Hz: leave it out"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from inspect import signature
 
@@ -95,6 +96,20 @@ def test_a_second_measurement_of_the_path_may_tell_how_well_it_is_known(command,
     code, out, _ = command("verdict", *scene, "--secondary-again", "other.wav")
     assert (same, code) == (0, 0)
     assert json.loads(out)["limited_by"] is None  # the path is learned
+
+
+@pytest.mark.parametrize("option", ["--impedance", "--displacement"])
+def test_a_curve_is_a_local_file_that_is_not_unpacked(option, command, tmp_path):
+    (tmp_path / "x.csv.gz").write_bytes(gzip.compress(b"20,7\n80,40\n"))
+    rating = ["--ohm", "8", "--watt", "20", "--loudspeaker-watt", "1", "--x-max-mm", "2"]
+    other = [] if option == "--displacement" else ["--displacement", "falling.csv"]
+    for path, message in (
+        ("http://127.0.0.1:9/x.csv", "http://127.0.0.1:9/x.csv does not exist or is not a file"),
+        (tmp_path / "x.csv.gz", "must hold two numbers in a line"),
+    ):
+        code, _, err = command("verdict", *SCENE, *rating, option, path, *other)
+        assert code == 2
+        assert message in err
 
 
 def test_a_loudspeakers_curves_are_read_from_files(command, folder):

@@ -1,9 +1,12 @@
 """Identification: exact recovery, lstsq as the oracle, what noise and clipping do to it."""
 
+import tracemalloc
+
 import control
 import numpy as np
 import pytest
 import scipy.signal
+from scipy.signal import fftconvolve, lfilter
 
 from kfopc_filterpy.paths.identification import (
     estimate_path,
@@ -27,6 +30,36 @@ def test_noiseless_identification_is_exact(excitation):
     assert isinstance(result.estimate, control.TransferFunction)
     assert result.estimate.dt == 1 / FS
     np.testing.assert_array_equal(path_taps(result.estimate), result.taps)
+
+
+@pytest.mark.parametrize(("n_loudspeakers", "n_samples"), [(1, 7000), (2, 12000)])
+def test_more_taps_than_a_matrix_is_made_for_are_found_by_iteration(n_loudspeakers, n_samples):
+    """The gradient of least squares vanishes: an iteration that ends at 1e-9 leaves 1e-7 of it."""
+    rng, n_taps, ridge = np.random.default_rng(0), 2100, 1e-5
+    x = lfilter([1.0, 0.8], 1.0, rng.standard_normal((n_loudspeakers, n_samples)))
+    paths = rng.standard_normal((n_loudspeakers, n_taps)) * np.exp(-np.arange(n_taps) / 300)
+    y = sum(fftconvolve(signal, path)[:n_samples] for signal, path in zip(x, paths, strict=True))
+    y = y + 0.1 * rng.standard_normal(n_samples)
+    taps = estimate_path(x, y[np.newaxis], n_taps, FS, regularization=ridge).taps[0]
+    left = y[n_taps - 1 :] - sum(fftconvolve(s, t, "valid") for s, t in zip(x, taps, strict=True))
+    for signal, path in zip(x, taps, strict=True):
+        gradient = fftconvolve(signal, left[::-1], "valid")[::-1] / left.size
+        power = np.mean(signal[n_taps - 1 :] ** 2)
+        assert np.abs(gradient - ridge * power * path).max() < 1e-7 * power * np.abs(paths).max()
+
+
+def test_30_000_taps_take_no_matrix():
+    """Which would take 6.7 GiB."""
+    n_taps = 30_000
+    x, path = np.random.default_rng(0).standard_normal(4 * n_taps), np.exp(-np.arange(n_taps) / 3000)
+    tracemalloc.start()
+    found = estimate_path(x, fftconvolve(x, path)[: x.size], n_taps, FS)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(found.taps, path, atol=1e-3)  # the ridge leaves 1e-5 of a tap's neighbours
+    assert peak < 100e6
+    with pytest.raises(ValueError, match=r"30000 weights need a matrix of 6\.71 GiB"):
+        estimate_path(x, x, n_taps, FS, regularization=0)
 
 
 def test_estimate_of_a_recording_is_dense_least_squares():

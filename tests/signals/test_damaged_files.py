@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import struct
+import subprocess
+import sys
 import tracemalloc
 import zipfile
 import zlib
@@ -16,6 +19,7 @@ import numpy as np
 import pytest
 import scipy.io
 import soundfile
+from helpers.commands import ROOT
 from helpers.files import FS, WRITERS, rew_text, signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -111,7 +115,9 @@ def test_damaged_files_are_read_or_refused_with_a_message(name, originals, tmp_p
     path = tmp_path_factory.mktemp("damaged") / name
     outcomes = []
 
-    @settings(max_examples=EXAMPLES, deadline=None)
+    is_hdf5 = name in ("new.mat", "x.sofa")  # which takes a process for each
+
+    @settings(max_examples=EXAMPLES // 6 if is_hdf5 else EXAMPLES, deadline=None)
     @given(st.lists(EDIT, min_size=1, max_size=4))
     def search(edits):
         path.write_bytes(damaged(originals(name), edits))
@@ -191,6 +197,13 @@ def _claims(path: Path, name: str) -> None:
             zeros = file.create_dataset("zeros", (1, 10**11), "f8", chunks=(1, 10**5), compression="gzip")
             zeros.attrs["MATLAB_class"] = np.bytes_("double")
             del file["noise"]
+    elif name == "chunks.mat":
+        h5py = pytest.importorskip("h5py")
+        WRITERS["new.mat"](path)
+        with h5py.File(path, "a") as file:
+            del file["noise"]
+            noise = file.create_dataset("noise", (1, 500_000), "f8", chunks=(1, 1), compression="gzip")
+            noise.attrs["MATLAB_class"] = np.bytes_("double")
     elif name == "inflated.mat":
         _inflated(path)
     elif name == "cells.mat":
@@ -229,6 +242,7 @@ CLAIMS = {
     "header.npz": "claims 2e\\+07 samples",
     "x.npy": "its header claims 8000000000000 bytes of data",
     "new.mat": "claims 1e\\+11 samples",
+    "chunks.mat": "its 500000 chunks take as much memory as 2.56e\\+08 samples",
     "inflated.mat": "is damaged: a chunk is larger than its 2400 bytes",
     "rew.txt": "with its start time it has 1.6e\\+10 samples",
 }
@@ -241,6 +255,69 @@ def test_a_file_that_claims_far_more_than_it_has_is_refused_before_it_takes_the_
     with Memory() as memory, pytest.raises(ValueError, match=CLAIMS[name]):
         read_path(tmp_path / name)
     assert memory.peak < 2.1 * room_of(tmp_path / name)
+
+
+READ = """
+import resource, sys, time
+from kfopc_filterpy.paths import read_path
+began = time.monotonic()
+try:
+    read_path(sys.argv[1])
+except ValueError as error:
+    print(error)
+print(time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and measured on Linux only")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [("size", "its library ended .* or took longer than 10 s"), ("length", "memory allocation failed")],
+)
+def test_what_leads_libhdf5_astray_ends_in_time_and_within_the_memory(change, message, tmp_path):
+    """The size of an object in the global heap becomes 0, which is a loop; the length of an attribute, which is 4.1 GB."""
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "x.sofa"
+    with h5py.File(path, "w") as file:
+        file.attrs.update({"Conventions": "SOFA", "DataType": "FIR"})
+        file["Data.IR"], file["Data.SamplingRate"] = np.ones((1, 1, 64)), [float(FS)]
+    assert read_path(path).samples.size == 64
+    content = bytearray(path.read_bytes())
+    heap = content.index(b"GCOL")
+    if change == "size":
+        content[heap + 24] = 0
+    else:
+        reference = content.index(heap.to_bytes(8, "little"))
+        content[reference - 4 : reference] = b"\x00\x00\x00\xf4"
+    path.write_bytes(content)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", READ, path], env=environment, capture_output=True, text=True, timeout=60)
+    assert re.search(message, done.stdout), done
+    seconds, megabytes = map(float, done.stdout.split()[-2:])
+    assert seconds < 30  # 10 s, and what a busy machine needs to start
+    assert megabytes < 150 + 3 * 64  # what Python, numpy and h5py take, and three times the room of the file
+
+
+@pytest.mark.parametrize("fs", [1e-310, 1e308])
+def test_a_sampling_rate_that_is_none_is_refused(fs, tmp_path):
+    h5py = pytest.importorskip("h5py")
+    WRITERS["x.sofa"](tmp_path / "x.sofa")
+    with h5py.File(tmp_path / "x.sofa", "r+") as file:
+        file["Data.SamplingRate"][...] = fs
+    with pytest.raises(ValueError, match=r"rate that .*x\.sofa states must be a sampling rate from 0\.001 to 1e\+09 Hz"):
+        read_path(tmp_path / "x.sofa", fs=FS)
+    WRITERS["x.npy"](tmp_path / "x.npy")
+    for rates in ({"fs": fs}, {"fs": FS, "file_fs": fs}):
+        with pytest.raises(ValueError, match="must be a sampling rate"):
+            read_recording(tmp_path / "x.npy", **rates)
+
+
+def test_resampling_to_any_rate_takes_no_more_than_the_room(tmp_path):
+    WRITERS["pcm16.wav"](tmp_path / "x.wav")
+    for reader in (read_path, read_recording):
+        with Memory() as memory, pytest.raises(ValueError, match="ratio of whole numbers up to 50000"):
+            reader(tmp_path / "x.wav", fs=99_999_999)
+        assert memory.peak < 1e6
 
 
 @pytest.mark.parametrize("name", ["x.flac", "packed.mat"])

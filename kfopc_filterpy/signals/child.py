@@ -1,0 +1,84 @@
+"""Reads a file in a process of its own, whose time and memory are limited: a library that a file can lead astray.
+
+libhdf5 loops for ever, or takes gigabytes, if a few bytes of a file are changed, and nothing within its process can stop
+it. The process costs 0.3 s. Its memory can be limited on Linux only.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from .content import Content, room_of
+
+_LEAST_S, _BYTES_PER_S = 10.0, 1e6  # how long a file may take
+_RUN = """
+import json, sys
+job = json.loads(sys.argv[1])
+sys.path[:] = job.pop("search")
+from kfopc_filterpy.signals.child import serve
+serve(**job)
+"""
+
+
+def read_in_child(read: Callable[..., Content], path: str | os.PathLike[str], *more: str | None) -> Content:
+    """Return what the function `read` returns for a file and more arguments; it must be known by its name."""
+    limit_s = _LEAST_S + Path(path).stat().st_size / _BYTES_PER_S
+    job = {"function": [read.__module__, read.__name__], "arguments": [os.fspath(path), *more], "limit_s": limit_s}
+    command = [sys.executable, "-c", _RUN, json.dumps(job | {"search": sys.path})]
+    with subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as child:
+        try:
+            assert child.stdout is not None
+            line = child.stdout.readline()
+            answer = json.loads(line or "{}")
+            if "shape" in answer:
+                samples = np.empty(answer.pop("shape"))
+                if child.stdout.readinto(samples.reshape(-1).view(np.uint8)) == samples.nbytes:
+                    return Content(samples, **answer)
+        finally:
+            child.kill()
+    raise ValueError(
+        answer.get("error")
+        or f"{path} is damaged: its library ended (exit code {child.returncode}), or took longer than {limit_s:.0f} s"
+    )
+
+
+def serve(function: tuple[str, str], arguments: list[str], limit_s: float) -> None:
+    """Write what a function returns, or its error, to the standard output: a line of JSON, then the samples."""
+    faulthandler.dump_traceback_later(limit_s, exit=True)  # also if a library never returns
+    module, name = function
+    try:
+        read = getattr(import_module(module), name)
+        _limit_memory(3 * room_of(arguments[0]))
+        content: Content = read(*arguments)
+        samples = np.ascontiguousarray(content.samples, dtype=np.float64)
+        answer = content._replace(samples=None)._asdict() | {"shape": samples.shape}
+        del answer["samples"]
+    except Exception as error:
+        samples, answer = np.empty(0), {"error": str(error) or type(error).__name__}
+    with open(1, "wb") as output:
+        output.write(json.dumps(answer).encode() + b"\n")
+        output.write(samples.data)
+
+
+def _limit_memory(n_bytes: int) -> None:
+    """Let this process take so much memory beyond what it has."""
+    if sys.platform != "linux":
+        return
+    import resource
+
+    import h5py  # noqa: F401  which takes its own memory first
+
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + n_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
