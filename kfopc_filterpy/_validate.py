@@ -121,7 +121,9 @@ def as_rate(value: Any, name: str) -> float:
     """Return `value` as a sampling rate in Hz of a recorded signal."""
     rate = as_positive(value, name, unit="Hz")
     if not _LOWEST_RATE <= rate <= _HIGHEST_RATE:
-        raise ValueError(f"{name} must be a sampling rate from {_LOWEST_RATE:g} to {_HIGHEST_RATE:g} Hz, got {rate:g} Hz")
+        raise ValueError(
+            f"{name} must be a sampling rate from {_LOWEST_RATE:g} to {_HIGHEST_RATE:g} Hz, got {rate:g} Hz"
+        )
     return rate
 
 
@@ -186,7 +188,7 @@ def as_rate_ratio(fs: float, new_fs: float) -> tuple[int, int]:
     """Return `new_fs / fs` as a ratio (up, down) of whole numbers."""
     ratio = Fraction(new_fs / fs).limit_denominator(_LARGEST_OF_RATIO)
     # An irrational ratio comes within 2e-10.
-    if not 0 < ratio <= _LARGEST_OF_RATIO or abs(fs * ratio - new_fs) > 1e-12 * new_fs:
+    if not 0 < ratio.numerator <= _LARGEST_OF_RATIO or abs(fs * ratio - new_fs) > 1e-12 * new_fs:
         raise ValueError(
             f"sample rates must be in a ratio of whole numbers up to {_LARGEST_OF_RATIO}, got {fs:g} and {new_fs:g} Hz; "
             "round them to whole Hz"

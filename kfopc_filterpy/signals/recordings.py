@@ -11,7 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validate import as_channels, as_count, as_number, as_positive, as_rate, as_rate_ratio, as_real_array, require_finite
+from .._validate import (
+    as_channels,
+    as_count,
+    as_number,
+    as_positive,
+    as_rate,
+    as_rate_ratio,
+    as_real_array,
+    require_finite,
+)
 from .._writing import replacing
 from .arrays import read_npy, read_npz
 from .audio import read_audio
