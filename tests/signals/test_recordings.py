@@ -210,7 +210,7 @@ def test_a_recording_is_resampled_and_keeps_its_height(tmp_path):
 
 
 def test_rates_that_contradict_or_have_no_ratio_are_refused(tmp_path):
-    write_wav(tmp_path / "x.wav", np.ones(8), FS)
+    write_wav(tmp_path / "x.wav", np.ones(200), FS)
     with pytest.raises(
         ValueError, match=r"x\.wav states a sampling rate of 16000 Hz, but file_fs = 8000 Hz: leave it out"
     ):
@@ -220,8 +220,8 @@ def test_rates_that_contradict_or_have_no_ratio_are_refused(tmp_path):
     for fs in (0, -1, np.nan):
         with pytest.raises(ValueError, match=r"fs must be"):
             read_recording(tmp_path / "x.wav", fs=fs)
-    with pytest.raises(ValueError, match=r"resampled from 16000 to 4.8e\+10 Hz it has 2.4e\+07 samples"):
-        read_recording(tmp_path / "x.wav", fs=FS * 3_000_000)
+    with pytest.raises(ValueError, match=r"resampled from 16000 to 8e\+08 Hz it has 1e\+07 samples"):
+        read_recording(tmp_path / "x.wav", fs=FS * 50_000)
 
 
 def test_a_scale_comes_with_its_unit(tmp_path):
