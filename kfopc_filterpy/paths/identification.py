@@ -127,7 +127,8 @@ def estimate_path(
     ------
     TypeError, ValueError
         If the signals differ in length, are shorter than ``(J + 1) n_taps - 1`` (in turn, or with one loudspeaker,
-        ``2 n_taps - 1``), silent or not finite, or loudspeakers play the same noise at once.
+        ``2 n_taps - 1``), silent or not finite, or loudspeakers play the same noise at once; if more than 16384 taps in all
+        are to be fitted without a ridge.
 
     Examples
     --------
