@@ -102,8 +102,8 @@ def ridge_solve(signals: np.ndarray, right: np.ndarray, ridges: np.ndarray) -> n
     def multiplied(weights: np.ndarray) -> np.ndarray:
         filters = weights.reshape(n_signals, n_taps)
         output = fftconvolve(signals, filters, "valid", axes=1).sum(axis=0)
-        each = zip(signals, ridges, filters, strict=True)
-        return np.concatenate([cross_correlation(output, s) + ridge * taps for s, ridge, taps in each])
+        back = fftconvolve(signals, output[np.newaxis, ::-1], "valid", axes=1)[:, ::-1] / output.size
+        return (back + ridges[:, np.newaxis] * filters).ravel()
 
     size = next_fast_len(length + n_taps, real=True)
     lags = irfft(np.abs(rfft(signals, size)) ** 2, size)[:, :n_taps] / length * (1 - np.arange(n_taps) / n_taps)
