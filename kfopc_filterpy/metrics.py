@@ -56,6 +56,7 @@ __all__ = [
 ]
 
 SOUND_PRESSURE = 2e-5  # Pa, the reference of sound pressure levels
+BAND_ORDER, HIGHEST_BAND = 4, 0.48  # of a third octave's filter, and its upper edge over fs: then it keeps to class 1
 
 # Half the main lobe of the four-term Blackman-Harris window, in Fourier bins.
 _LOBE_BINS = 4
@@ -620,25 +621,24 @@ def a_weighting_db(frequencies_hz: ArrayLike) -> np.ndarray:
     if np.any(f < 0):
         raise ValueError(f"frequencies_hz must not be negative, got {f.min():g} Hz")
     with np.errstate(divide="ignore"):
-        return 20 * np.log10(_a_response(f) / _a_response(np.array(1000.0)))
+        return 20 * np.log10(np.abs(_a_response(f) / _a_response(np.array([1000.0]))))
 
 
 def _a_response(f: np.ndarray) -> np.ndarray:
-    one, two, three, four = 20.598997, 107.65265, 737.86223, 12194.217
-    square = f**2
-    return (
-        four**2
-        * square**2
-        / ((square + one**2) * np.sqrt((square + two**2) * (square + three**2)) * (square + four**2))
-    )
+    """Return the complex response of the analogue filter A, which is causal, without its gain."""
+    from scipy.signal import freqs_zpk
+
+    one, two, three, four = -2 * np.pi * np.array([20.598997, 107.65265, 737.86223, 12194.217])
+    return freqs_zpk([0, 0, 0, 0], [one, one, two, three, four, four], 1.0, 2 * np.pi * f)[1]
 
 
 def a_weighted_level_db(
     signal: ArrayLike, fs: float, *, reference: float = SOUND_PRESSURE, steady: float = 0.5
 ) -> NumberOrArray:
-    """Return the A-weighted level, in dBA if the signal is a sound pressure in Pa.
+    """Return the A-weighted equivalent level, LAeq, in dBA if the signal is a sound pressure in Pa.
 
-    It is the equivalent level of the steady portion. The weighting is applied to the spectrum.
+    It is the mean over the steady portion of the square of the weighted signal. The filter begins with the signal, and
+    its response is that of `a_weighting_db` up to fs/2.
 
     Parameters
     ----------
@@ -663,9 +663,12 @@ def a_weighted_level_db(
     >>> round(a_weighted_level_db(tone(100.0, 2.0, fs=16000, amplitude=2**0.5), 16000), 1)  # 1 Pa rms, 94.0 dB
     74.8
     """
-    frequencies, powers = _powers_of_bins(signal, fs, steady)
-    weighted = np.sum(powers * 10 ** (a_weighting_db(frequencies) / 10), axis=-1)
-    return _figure(_ratio_db(weighted, as_positive(reference, "reference") ** 2))
+    signal, fs = _as_runs(signal, "signal", False)[0], as_positive(fs, "fs", unit="Hz")
+    length = signal.shape[-1]
+    padded = 2 * length  # so that the end does not reach the beginning
+    response = _a_response(np.fft.rfftfreq(padded, 1 / fs)) / np.abs(_a_response(np.array([1000.0])))
+    weighted = np.fft.irfft(np.fft.rfft(signal, padded) * response, padded)[..., :length]
+    return _level_db(weighted, steady, reference)
 
 
 def third_octave_levels_db(
@@ -674,8 +677,9 @@ def third_octave_levels_db(
     """Return the levels in third-octave bands from 25 Hz on.
 
     The bands are those of IEC 61260-1 with base ten: exact centres ``1000 * 10**(k/10)``, edges half a tenth of a decade
-    to each side. The powers of the Fourier bins within the edges are added, so a band is a rectangle, as the narrowest
-    filters of the standard approach it. Bands that do not end below fs/2, or that hold no bin, are left out.
+    to each side. The filters are Butterworth band-passes of eight poles, which keep to class 1 of that standard. The
+    signal is filtered from its beginning, and the level is the mean over the steady portion. Bands that do not end below
+    0.48 fs are left out, and those in which the portion is shorter than one over the bandwidth.
 
     Parameters
     ----------
@@ -712,24 +716,23 @@ def third_octave_levels_db(
     >>> print(f"{levels.max():.1f} dB in the band at {centres[levels.argmax()]:.0f} Hz")
     94.0 dB in the band at 100 Hz
     """
-    frequencies, powers = _powers_of_bins(signal, fs, steady)
+    from scipy.signal import butter, sosfilt
+
+    signal, fs = _as_runs(signal, "signal", False)[0], as_positive(fs, "fs", unit="Hz")
     exact = 1000.0 * 10.0 ** (np.arange(-16, 14) / 10.0)
-    edges = np.searchsorted(frequencies, np.stack([exact * 10**-0.05, exact * 10**0.05]))
-    kept = (exact * 10**0.05 < frequencies[-1]) & (edges[1] > edges[0])
+    low, high = exact * 10**-0.05, exact * 10**0.05
+    kept = (high < HIGHEST_BAND * fs) & ((high - low) * _steady_part(signal, steady).shape[-1] >= fs)
     if not np.any(kept):
-        raise ValueError(f"signal must be longer for a third-octave band, got {frequencies.size} Fourier bins")
-    bands = [np.sum(powers[..., first:last], axis=-1) for first, last in edges.T[kept]]
-    return exact[kept], _ratio_db(np.stack(bands, axis=-1), as_positive(reference, "reference") ** 2)
+        raise ValueError(f"signal must be longer for a third-octave band, got {signal.shape[-1]} samples at {fs:g} Hz")
+    filters = [butter(BAND_ORDER, edges, "bandpass", fs=fs, output="sos") for edges in zip(low[kept], high[kept], strict=True)]
+    levels = [_level_db(sosfilt(sections, signal), steady, reference) for sections in filters]
+    return exact[kept], np.stack(levels, axis=-1)
 
 
-def _powers_of_bins(signal: Any, fs: float, steady: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Fourier bins of the steady portion and the power in each, (..., n_bins), by a Hann window."""
-    from scipy.signal import periodogram
-
-    fs = as_positive(fs, "fs", unit="Hz")
-    settled = _steady_part(_as_runs(signal, "signal", False)[0], steady)
-    frequencies, density = periodogram(settled, fs, window="hann", detrend=False)
-    return frequencies, density * fs / settled.shape[-1]
+def _level_db(signal: np.ndarray, steady: float, reference: float) -> Any:
+    """Return the level of the steady portion, a mean over time."""
+    power = np.mean(_steady_part(signal, steady) ** 2, axis=-1)
+    return _figure(_ratio_db(power, as_positive(reference, "reference") ** 2))
 
 
 def _as_runs(value: Any, name: str, runs: bool) -> np.ndarray:

@@ -464,3 +464,42 @@ def test_the_bands_of_noise_add_up_and_channels_stay_apart():
     np.testing.assert_allclose(levels[0][centres > 100], 10 * np.log10(width / (fs / 2))[centres > 100], atol=1.0)
     with pytest.raises(ValueError, match="must be longer for a third-octave band"):
         metrics.third_octave_levels_db(np.ones(4), fs)
+
+
+# IEC 61260-1, table 1, class 1: frequencies of octave bands over their centre, as exponents of 10**0.3, with the least
+# attenuation from there on, and the largest up to there, in dB.
+CLASS_1_LEAST = ([0.5, 1, 2, 3, 4], [1.2, 16.6, 40.5, 60.0, 70.0])
+CLASS_1_MOST = ([0, 1 / 8, 1 / 4, 3 / 8, 0.5], [0.4, 0.5, 0.7, 1.4, 5.3])
+
+
+@pytest.mark.parametrize("fs", [5000, 16000])
+def test_every_third_octave_keeps_to_class_1(fs):
+    tones = np.geomspace(20.0, 0.499 * fs, 120)
+    signals = np.sqrt(2) * np.sin(2 * np.pi * tones[:, np.newaxis] * np.arange(3 * fs) / fs)
+    centres, levels = metrics.third_octave_levels_db(signals, fs, reference=1.0)
+    assert centres[-1] * 10**0.05 > 0.38 * fs  # up to fs/2 but for a band
+    ratio = np.exp(np.abs(np.log(tones[:, np.newaxis] / centres)))  # the limits are the same on both sides
+
+    def limits(exponents, decibels):  # of a third octave, by equation 11 of the standard
+        edges = 1 + (10**0.05 - 1) / (10**0.15 - 1) * (10 ** (0.3 * np.array(exponents)) - 1)
+        return np.interp(np.log(ratio), np.log(edges), decibels)
+
+    inside = ratio < 10**0.05
+    assert np.all(-levels[inside] <= limits(*CLASS_1_MOST)[inside])
+    assert np.all(-levels >= np.where(inside, -0.4, limits(*CLASS_1_LEAST)))
+
+
+def test_a_level_is_a_mean_over_time_wherever_the_sound_is():
+    """Noise in a sixteenth of the steady half has a sixteenth of the power of noise that lasts, at its end as well."""
+    fs, n = 16000, 32000
+    noise = np.random.default_rng(0).standard_normal(n // 16)
+    bursts = np.zeros((3, 2 * n))
+    for row, place in zip(bursts, (n, n + n // 2, 2 * n - noise.size), strict=True):
+        row[place : place + noise.size] = noise
+    frequencies = np.fft.rfftfreq(noise.size, 1 / fs)
+    powers = 2 * np.abs(np.fft.rfft(noise) / noise.size) ** 2
+    expected = 10 * np.log10(np.sum(powers * 10 ** (metrics.a_weighting_db(frequencies) / 10)) / 16)
+    # The burst's own spectrum, as if it repeated; where it is cut, its ends differ by hundredths of a decibel.
+    np.testing.assert_allclose(metrics.a_weighted_level_db(bursts, fs, reference=1.0), expected, atol=0.05)
+    _, levels = metrics.third_octave_levels_db(bursts, fs, reference=1.0)
+    np.testing.assert_allclose(levels[0], levels[1], atol=0.01)  # the end would cut what its filters still play

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field
-from functools import cached_property
 from types import SimpleNamespace
 from typing import Any
 
@@ -56,12 +55,9 @@ class Plan:
         with self.lock:
             self.bar.update(samples)
 
-    def run(self, name: str, *, limited: bool, freed: float = 1.0) -> SimulationResult:
-        """Run an algorithm, behind a limiter or not; `freed` multiplies the rating's power."""
-        limits = self.limits
-        if freed != 1.0:
-            announce(self.bar, self.x.shape[-1] - self.start, f"{name}, unlimited")
-            limits = scaled(limits, freed)
+    def run(self, name: str, *, limited: bool, share: float = 1.0) -> SimulationResult:
+        """Run an algorithm, behind a limiter or not, with a share of the rating's power."""
+        limits = scaled(self.limits, share)
         return simulate(
             self.controller(name, limits, limited),
             self.x,
@@ -84,7 +80,7 @@ class Plan:
             outside["n_references"] = len(self.x)
         noises: dict[str, Any] = self.settings.settings
         if name == "FxLMS":
-            return FxLMS(n_taps, self.s, step_size=self.step_size, **outside)
+            return FxLMS(n_taps, self.s, step_size=self.step_size(limits), **outside)
         if name == "KF-OPC":
             each = [OutputPowerConstraint(one.rated_power, fs=self.fs) for one in each_of(limits)]
             return kf_opc(n_taps, self.s, constraint=each if several else each[0], **outside, **noises)
@@ -102,12 +98,11 @@ class Plan:
         """Samples of the record's start on which each step size is tried."""
         return min(round(TUNED_ON_S * self.fs), self.x.shape[-1] - self.start)
 
-    @cached_property
-    def step_size(self) -> float:
-        """Step size of FxLMS by the rule of the studies, on the start of the record."""
+    def step_size(self, limits: Limits) -> float:
+        """Return the step size of FxLMS by the rule of the studies, on the start of the record."""
         excerpt = slice(0, self.start + self.tuning_samples)
         scene = recorded_scene(
-            self.x[..., excerpt], self.d[..., excerpt], self.s, self.fs, self.start, self.limits, self.settings
+            self.x[..., excerpt], self.d[..., excerpt], self.s, self.fs, self.start, limits, self.settings
         )
         in_samples: Any = SimpleNamespace(update=lambda runs: self.advance(runs * self.tuning_samples))
         runs = Runs(None if self.bar is None else in_samples)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -36,19 +37,22 @@ from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.file_checks import require_heard, require_sound
 from kfopc_filterpy.paths.path_matrix import primary_paths, secondary_paths
 from kfopc_filterpy.paths.uncertainty import Uncertainty
-from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
+from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_remarks
 
 from .._types import PathModels, ProgressBar
 from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce
 from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on
 from .fixed_filters import FixedFilters, longest_filter
-from .limits import Limits, Ratings, excursion_mm, limits_of, ratings_of_each, scale_of, share_taken, with_excursion
+from .limits import Limits, Ratings, excursion_mm, limits_of, ratings_of_each, scale_of, watt_per_power, with_excursion
 from .scene import Runs, one_blas_thread
 
 MOST_DIRECT_WEIGHTS = 256  # from which KF-OPC runs beside KF-PB only if asked: a sample takes K (J I L)^2 operations
 MEMORY_S, CHANNEL_MEMORY_S = 0.25, 1.0
 WEAK_DB = -20.0  # gain of the secondary path, over its mean in the noise's band, below which the loudspeaker is weak
-NEARLY_FREE = 1e6  # times the rated power: an amplifier without limits
+LEAST_RUN_S = 2.0  # its second half then has ten of an amplifier's windows of 0.1 s
+LEAST_TOLERANCE = 0.01  # of the least rated power
+SAME_DB, KEPT = 0.1, 1.02  # runs that differ by less are as good, and a rating that is exceeded by less is kept
+NEARLY_FREE = 1e6  # times the power of the bound: an amplifier without limits
 
 
 @one_blas_thread()
@@ -126,15 +130,18 @@ def assess(
     Raises
     ------
     TypeError, ValueError
-        Signals that are not finite, silent, too short for the filter, or of different lengths; paths whose channels do not
+        Signals that are not finite, silent, too short for the filter or for a run of 2 s, or of different lengths; paths whose channels do not
         fit the signals; neither a primary path nor a disturbance; a rating that does not limit the mean power, or ratings
         for another number of loudspeakers; an unknown algorithm.
 
     Notes
     -----
     The cause is the first ceiling that does not reach `want_db`; see `Ceilings`. If all of them do and the run does not,
-    it is repeated with a million times the rated power: the amplifier is the cause if that reaches it (its peaks and its
-    short windows cost more than its mean power), otherwise the adaptation is.
+    the amplifier is the cause if a run with more power reaches it (peaks and short windows cost more than the mean
+    power), otherwise the adaptation is.
+
+    The least rated power is found by bisection: the run is repeated with other ratings, about six times. They do not
+    depend on the rating that is given, only on its proportions: of the loudspeakers, and of peak and mean power.
 
     The algorithms run side by side, on as many cores as there are. The numerical libraries get one thread meanwhile if
     threadpoolctl is installed (it is in the extra `studies`): with filters of this size, more of them slow each other down.
@@ -172,6 +179,12 @@ def assess(
     if memory_s is None:
         memory_s = CHANNEL_MEMORY_S if several else MEMORY_S
     start = switch_on_sample(switch_on_s, fs, x.shape[-1])
+    run_s = (x.shape[-1] - start) / fs
+    if run_s < LEAST_RUN_S:
+        raise ValueError(
+            f"noise must last {LEAST_RUN_S:g} s after the control is switched on, got {run_s:.3g} s: a shorter run says "
+            f"nothing; record at least {SHORT_S:g} s"
+        )
     notes: list[str] = []
     announce(bar, 0, "bounds")
     with warnings.catch_warnings(record=True) as caught:
@@ -219,8 +232,20 @@ def assess(
         power_db=bounds.limited(limits.rated_power)[1],
     )
     cause = None if reached >= want_db else _cause(ceilings, want_db)
-    if cause == "adaptation" and _reduction(plan.run(algorithm, limited=True, freed=NEARLY_FREE)) >= want_db:
+    volts_per_unit, ohm = (scale_of(ratings, name, several) for name in ("volts_per_unit", "ohm"))
+    watts = watt_per_power(ratings, several)
+    least = np.inf if want_db else 0.0
+    if want_db and cause in (None, "amplifier", "adaptation"):
+        first = required if np.all(np.isfinite(required)) else bounds.free.control_power
+        unit = np.ravel(limits.rated_power * (1.0 if watts is None else watts))[0]
+        least = _least_share(plan, algorithm, want_db, np.max(first / limits.rated_power), unit)
+    if cause == "adaptation" and np.isfinite(least):
         cause = "amplifier"
+    figures = {name: _figures(one, limits, fs) for name, one in runs.items()}
+    notes += _on_better_runs(figures, algorithm)
+    if watts is None:
+        unknown = "the rating states no impedance" if ohm is None else "volts_per_unit is not known, and taken as 1 V"
+        notes.append(f"Powers are mean squares of the control signal, not watts: {unknown}.")
     notes += recording_remarks(noise, fs, "noise")
     if disturbance is not None:
         notes += clipping_remarks(disturbance, "disturbance")
@@ -229,7 +254,6 @@ def assess(
             "The disturbance was computed from the reference, so the coherence is not checked: record both microphones "
             "together and give the disturbance."
         )
-    bound_share = np.max(bounds.needed(reached, limits.rated_power) / limits.rated_power)
     assessment = Assessment(
         enough=cause is None,
         want_db=want_db,
@@ -243,18 +267,18 @@ def assess(
         bound_db=official,
         unlimited_power=bounds.free.control_power,
         required_rated_power=required,
-        expected_rated_power=required * _price(share_taken(run, limits), bound_share),
+        least_rated_power=least * limits.rated_power,
         causality_margin_s=None if p is None else causality_margin(p if several else p[0, 0], s, fs=fs).margin_s,
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
         band=_band(bounds.d, s, fs),
         levels=None if pascals is None else _levels(run, pascals),
         excursion_mm=excursion_mm(ratings, run),
         settings=settings,
-        figures={name: _figures(one, limits, fs) for name, one in runs.items()},
+        figures=figures,
         runs=runs,
         curve=bounds.curve(limits.rated_power),
-        volts_per_unit=scale_of(ratings, "volts_per_unit", several),
-        ohm=scale_of(ratings, "ohm", several),
+        volts_per_unit=volts_per_unit,
+        ohm=ohm,
         fs=fs,
         channels=(n_references, J, K) if several else None,
         pascal_per_unit=pascal_per_unit,
@@ -343,9 +367,50 @@ def _reduction(run: SimulationResult) -> float:
     return -np.inf if np.isnan(reached) else reached
 
 
-def _price(taken: float, of_the_bound: float) -> float:
-    """Return how many times the power of the bound the controller takes, at least 1; Inf if it reached nothing."""
-    return max(float(taken / of_the_bound), 1.0) if of_the_bound > 0 else np.inf
+def _least_share(plan: Plan, name: str, want_db: float, start: float, unit: float) -> float:
+    """Return the least share of the rating with which an algorithm's run reaches a noise reduction; Inf if none does.
+
+    The search begins at the share `start`. It tries powers of three digits, which are those that are printed: `unit` is
+    the power that is printed for a share of 1.
+    """
+    from scipy.optimize import brentq
+
+    tried: dict[float, float] = {}
+
+    def excess(log_power: float) -> float:
+        power = float(f"{np.exp(log_power):.3g}")
+        if power not in tried:
+            announce(plan.bar, plan.planned_samples(name), "least rating")
+            run = plan.run(name, limited=True, share=power / unit)
+            tried[power] = max(_reduction(run) - want_db, -sys.float_info.max)
+        return tried[power]
+
+    low = high = np.log(start * unit)
+    step, highest = np.log(2.0), high + np.log(NEARLY_FREE)
+    while excess(high) < 0:
+        if high >= highest:
+            return np.inf
+        low, high, step = high, high + step, 2 * step
+    while excess(low) >= 0:
+        low, high, step = low - step, low, 2 * step
+    brentq(excess, low, high, xtol=LEAST_TOLERANCE)
+    return min(power for power, more in tried.items() if more >= 0) / unit
+
+
+def _on_better_runs(figures: Mapping[str, Mapping[str, Any]], algorithm: str) -> list[str]:
+    """Return why the verdict is not on an algorithm that reduced the noise more, or that it should be."""
+    notes = []
+    for name, own in figures.items():
+        if own["noise_reduction_db"] > figures[algorithm]["noise_reduction_db"] + SAME_DB:
+            better = f"{name}, as published, reaches {own['noise_reduction_db']:.1f} dB"
+            mean, worst = (float(np.max(own[key])) for key in ("of_rated_power", "worst_window"))
+            notes.append(
+                f"{better} within the rating: choose it as the algorithm."
+                if worst <= KEPT
+                else f"{better}, but does not keep the rating: its mean power is {mean:.2g} times the rated power, and "
+                f"{worst:.2g} times in its worst window."
+            )
+    return notes
 
 
 def _cause(ceilings: Ceilings, want_db: float) -> str:

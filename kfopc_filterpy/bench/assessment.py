@@ -25,13 +25,13 @@ import math
 import os
 import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult
+from kfopc_filterpy import SimulationResult, __version__
 from kfopc_filterpy.bounds import SuggestedSettings
 from kfopc_filterpy.controllers.base import listed
 
@@ -41,7 +41,7 @@ from .fixed_filters import longest_filter
 from .limits import Limits
 from .study_report import jsonable
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 SCHEMA = Path(__file__).with_name("verdict.schema.json")
 ROOM_FOR_RESPONSE = 1.25  # times the time that a control filter must last
 MOST_TAPS = 1024  # that advice names: longer filters take very long
@@ -142,10 +142,9 @@ class Assessment:
     required_rated_power : float or ndarray, shape (J,)
         Rated power with which the bound reaches the noise reduction wanted; Inf if it is out of reach. With several
         loudspeakers in the proportions of their ratings.
-    expected_rated_power : float or ndarray, shape (J,)
-        An estimate of the rated power that the controller needs: `required_rated_power`, times the power of the rating
-        that its run took (by its worst window or its highest peak) over the one with which the bound reaches what the
-        controller reached. Inf if it is out of reach.
+    least_rated_power : float or ndarray, shape (J,)
+        Least rated power with which the controller's run reaches the noise reduction wanted, found by runs to 1 %; the
+        peaks that the rating allows are changed with it. Inf if none does.
     causality_margin_s : float or None
         Time by which the anti-noise is early; None without a primary path.
     helpful_delay_s : float or None
@@ -179,6 +178,8 @@ class Assessment:
     response_s : float or None
         Time from the first sound of a loudspeaker until the primary path has delivered the energy that must be removed:
         the control filter has to be so long. None without a primary path.
+    origin : dict of str to str
+        What the page says of where it comes from: the command, and each file.
     """
 
     enough: bool
@@ -193,7 +194,7 @@ class Assessment:
     bound_db: float
     unlimited_power: Any
     required_rated_power: Any
-    expected_rated_power: Any
+    least_rated_power: Any
     causality_margin_s: float | None
     helpful_delay_s: float | None
     band: Band
@@ -210,6 +211,7 @@ class Assessment:
     pascal_per_unit: Any = None
     switch_on_s: float = 0.0
     response_s: float | None = None
+    origin: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
@@ -221,7 +223,8 @@ class Assessment:
         return (
             f"{answer}: {self.algorithm} reaches {_db(self.noise_reduction_db)} with "
             f"{self.power(self.limits.rated_power)}, "
-            f"{abs(missed):.1f} dB {'more' if missed >= 0 else 'less'} than the {self.want_db:g} dB wanted."
+            f"{abs(missed):.1f} dB {'more' if missed >= 0 else 'less'} than the {self.want_db:g} dB wanted, in a run of "
+            f"{self.runs[self.algorithm].n_samples / self.fs:.3g} s."
         )
 
     @property
@@ -281,7 +284,7 @@ class Assessment:
                 "bound_db": self.bound_db,
                 "unlimited_power": self.unlimited_power,
                 "required_rated_power": self.required_rated_power,
-                "expected_rated_power": self.expected_rated_power,
+                "least_rated_power": self.least_rated_power,
                 "causality_margin_s": self.causality_margin_s,
                 "helpful_delay_s": self.helpful_delay_s,
                 "band": vars(self.band),
@@ -290,6 +293,8 @@ class Assessment:
                 "settings": {"n_taps": self.settings.n_taps, **self.settings.settings},
                 "algorithms": self.figures,
                 "fs": self.fs,
+                "version": __version__,
+                "origin": self.origin,
             }
             | ({"channels": dict(zip(counts, self.channels, strict=True))} if self.channels else {}),
             "verdict",
@@ -349,13 +354,10 @@ _REASONS = {
 def advice_on(verdict: Assessment, *, fs: str = "fs=", n_taps: str = "n_taps=") -> list[str]:
     """Return what to change, in sentences; `fs` and `n_taps` are what the caller writes before these settings."""
     want = f"{verdict.want_db:g} dB"
-    needed = verdict.expected_rated_power
+    needed = verdict.least_rated_power
+    enough = [f"About {verdict.power(needed)} would do for {want}: the least with which the run reaches it."]
     if verdict.enough:
-        return (
-            [f"About {verdict.power(needed)} would do for {want}."]
-            if np.max(needed / verdict.limits.rated_power) < 0.9
-            else []
-        )
+        return enough if np.max(needed / verdict.limits.rated_power) < 0.9 else []
     if verdict.limited_by == "coherence":
         return [
             "Move the reference microphone closer to the source, or add one for each source; shield it from wind and "
@@ -373,14 +375,11 @@ def advice_on(verdict: Assessment, *, fs: str = "fs=", n_taps: str = "n_taps=") 
         return _advice_on_length(verdict, fs, n_taps)
     if verdict.limited_by == "adaptation":
         return ["Try a longer record: the controller may not have settled."]
-    advice = [
-        f"About {verdict.power(needed)} would do for {want}. This is an estimate: the power that the best fixed filter "
-        "needs, raised by as much as this controller takes more than such a filter."
-    ]
+    advice = enough
     if not np.all(np.isfinite(needed)):
         advice = [
-            f"A fixed filter would need {verdict.power(verdict.required_rated_power)} for {want}; this controller did "
-            "not reduce the noise at all. Try a longer record."
+            f"A fixed filter would need {verdict.power(verdict.required_rated_power)} for {want}; this controller does not "
+            "reach it with any power. Try a longer record."
         ]
     if verdict.band.weak_share > 0.1:
         advice.append(

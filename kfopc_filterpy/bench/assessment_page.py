@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult
+from kfopc_filterpy import SimulationResult, __version__
 from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
 from kfopc_filterpy.plot.style import new_axes
 
-from .assessment import Assessment
 from .page import images, players, rendered
 from .report import prepare_folder, write_files, write_whole
 from .study_report import EXCERPT_S, HEADROOM, SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Sound, StudyReport, Table
+
+if TYPE_CHECKING:
+    from .assessment import Assessment
 
 TEMPLATE = "verdict.html.jinja"
 NEEDED = ("jinja2", "latex2mathml", "matplotlib", "PIL")
@@ -67,6 +70,14 @@ def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Pat
         tables=study.tables,
         players=list(players(study, path, verdict.algorithm)),
         checks=_checks(verdict),
+        origin={
+            **verdict.origin,
+            "Sample rate": f"{verdict.fs:g} Hz",
+            "Control signal": "of 1 is "
+            + ("an unknown voltage" if verdict.volts_per_unit is None else f"{listed(verdict.volts_per_unit, 'g')} V"),
+            "Version": f"kfopc_filterpy {__version__}",
+            "Date": datetime.now().astimezone().isoformat(" ", "minutes"),
+        },
         settings=list(verdict.settings.reasons.items()),
         values={"n_taps": verdict.settings.n_taps, **verdict.settings.settings},
         headroom=HEADROOM,
@@ -293,7 +304,7 @@ def _checks(verdict: Assessment) -> list[tuple[str, str]]:
         ),
         ("Power for full control", verdict.power(verdict.unlimited_power)),
         (f"Least power for {verdict.want_db:g} dB, best fixed filter", _or_none(verdict, verdict.required_rated_power)),
-        ("Estimate for this controller, peaks included", _or_none(verdict, verdict.expected_rated_power)),
+        (f"Least power for {verdict.want_db:g} dB, {verdict.algorithm}, found by runs", _or_none(verdict, verdict.least_rated_power)),
         (
             "Causality",
             "unknown without a primary path"

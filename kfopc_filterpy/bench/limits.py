@@ -9,7 +9,6 @@ from typing import Any, TypeAlias, TypeGuard, cast
 import numpy as np
 
 from kfopc_filterpy import HardClipAmplifier, LinearAmplifier, SimulationResult
-from kfopc_filterpy.metrics import overshoot, peak_control_signal
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating, OutputLimits, output_limits
 
 from .._types import NumberOrArray
@@ -141,18 +140,6 @@ def clipping_limits(limits: Limits) -> NumberOrArray:
     never = np.sqrt(np.finfo(float).max)
     each = [never if one.amplitude_limit is None else one.amplitude_limit for one in each_of(limits)]
     return np.array(each) if isinstance(limits, ChannelLimits) else each[0]
-
-
-def share_taken(run: SimulationResult, limits: Limits) -> float:
-    """Return the least share of the limits, at most 1, that would have left a run as it is."""
-    worst = overshoot(run.control_signal, limits.rated_power, run.fs, window_s=limits.window_s)
-    peaks = np.atleast_1d(peak_control_signal(run.control_signal, steady=1.0))
-    of_peaks = [
-        0.0 if one.amplitude_limit is None else (peak / one.amplitude_limit) ** 2
-        for peak, one in zip(peaks, each_of(limits), strict=True)
-    ]
-    share = max(*np.atleast_1d(worst), *of_peaks)
-    return float(min(share, 1.0)) if np.isfinite(share) else 1.0
 
 
 def with_excursion(limits: Limits, ratings: Sequence[Sequence[Rating]], bounds: FixedFilters) -> Limits:

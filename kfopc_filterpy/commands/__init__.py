@@ -7,6 +7,7 @@ run; 2 for wrong input, with a message of one line; 130 if it was interrupted.
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 
@@ -37,7 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         0 done or enough, 1 not enough or stopped by a fault, 2 wrong input, 130 interrupted.
     """
-    options, unknown = _parser().parse_known_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options, unknown = _parser().parse_known_args(arguments, argparse.Namespace(command=shlex.join(["kfopc", *arguments])))
     try:
         if unknown:
             raise ValueError(f"unrecognized arguments: {' '.join(unknown)}; see {options.prog} --help")

@@ -49,6 +49,7 @@ class Files:
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
+        self.read: list[str] = []  # what was read, in words
         self.remarks: list[str] = []  # on flaws of the recordings that resampling hides
         self._fs = 0.0  # of the files that were read; 0 before the first
         self._first = ""
@@ -134,6 +135,9 @@ class Files:
                 "example with --fs 16000"
             )
         self._fs, self._first = read.fs, self._first or path
+        rate = "" if read.file_fs in (None, read.fs) else f" resampled from {read.file_fs:g} Hz"
+        what = "taps" if is_path else "samples"
+        self.read.append(f"{path}, {' x '.join(map(str, read.samples.shape))} {what} at {read.fs:g} Hz{rate}")
         return read
 
     def _chosen(self, path: str, source: str, is_path: bool, fs: float | None) -> Recording:
@@ -275,7 +279,6 @@ def _rating(own: argparse.Namespace) -> list[Any]:
             "the cone"
         )
     ratings: list[Any] = []
-    volts = own.volts_per_unit or 1.0
     used = {"rated_power"}
     if own.watt is not None or own.peak_volts is not None:
         if own.ohm is None:
@@ -283,7 +286,7 @@ def _rating(own: argparse.Namespace) -> list[Any]:
         if own.rated_power is not None:
             raise ValueError("--rated-power stands in place of --watt and --peak-volts: leave out one of them")
         watts = {f"{own.rating or 'sine'}_watt": own.watt}
-        ratings.append(AmplifierRating(own.ohm, peak_volts=own.peak_volts, volts_per_unit=volts, **watts))
+        ratings.append(AmplifierRating(own.ohm, peak_volts=own.peak_volts, volts_per_unit=own.volts_per_unit, **watts))
         used |= {"watt", "peak_volts", "ohm", "volts_per_unit"} | ({"rating"} if own.watt is not None else set())
     elif own.rated_power is not None:
         ratings.append(own.rated_power)
@@ -297,7 +300,7 @@ def _rating(own: argparse.Namespace) -> list[Any]:
                 programme_watt=own.programme_watt,
                 x_max_mm=own.x_max_mm,
                 displacement_mm_per_volt=None if own.displacement is None else _curve(own.displacement, "mm/V"),
-                volts_per_unit=volts,
+                volts_per_unit=own.volts_per_unit,
             )
         )
         used |= {*OF_A_LOUDSPEAKER} - ({"ohm"} if own.impedance is not None else set())

@@ -108,7 +108,8 @@ def add_recorded_scene(parser: argparse._ActionsContainer) -> None:
         help="signal with which the watts were measured (default: sine, which is on the safe side)",
     )
     add_number(rating, "--peak-volts", "V", help="voltage at which the amplifier clips", **each)
-    add_number(rating, "--volts-per-unit", "V", help="volts for a control signal of 1 (default: 1)", **each)
+    about = "volts for a control signal of 1; without it, 1 V is assumed, and results are not in watts"
+    add_number(rating, "--volts-per-unit", "V", help=about, **each)
     add_number(rating, "--rated-power", "", metavar="P", help="rated power as mean square, in place of watts", **each)
     about = "the loudspeaker's impedance, whose smallest value counts, in columns of Hz and ohm (default: --ohm)"
     rating.add_argument("--impedance", metavar="CSV", help=about, **each)

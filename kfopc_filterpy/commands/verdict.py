@@ -88,7 +88,8 @@ def verdict(options: argparse.Namespace) -> int:
             bar=bar,
         )
         advice = advice_on(found, fs="--fs ", n_taps="--taps ")
-        found = replace(found, advice=tuple(advice), notes=(*found.notes, *files.remarks))
+        origin = {"Command": options.command, "Files": "; ".join(files.read)}
+        found = replace(found, advice=tuple(advice), notes=(*found.notes, *files.remarks), origin=origin)
     tell(options, found.json if options.json else str(found), found.notes)
     if options.output is not None:
         say_written(options, found.write(options.output), "verdict.json")

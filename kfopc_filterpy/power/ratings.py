@@ -79,7 +79,12 @@ class _Rating:
 
     ohm: Any
     peak_volts: float | None
-    volts_per_unit: float
+    volts_per_unit: float | None
+
+    @property
+    def volts(self) -> float:
+        """Volts for a control signal of 1; 1 if they are not known."""
+        return 1.0 if self.volts_per_unit is None else self.volts_per_unit
 
     def _check_optional(self, **units: str) -> None:
         """Raise an error if one of these, by its unit, is given and not a positive number."""
@@ -94,12 +99,12 @@ class _Rating:
     def _mean_square(self, watts: float | None) -> float:
         """Return the rated power from the watts, or from the peak voltage if there are none; Inf if there is neither."""
         if watts is not None:
-            return watts * self.ohm / self.volts_per_unit**2
-        return math.inf if self.peak_volts is None else (self.peak_volts / self.volts_per_unit) ** 2 / 2.0
+            return watts * self.ohm / self.volts**2
+        return math.inf if self.peak_volts is None else (self.peak_volts / self.volts) ** 2 / 2.0
 
     def watt(self, power: NumberOrArray) -> NumberOrArray:
         """Return the watts of a mean square `power` of the control signal."""
-        return power * self.volts_per_unit**2 / self.ohm
+        return power * self.volts**2 / self.ohm
 
 
 @dataclass(frozen=True)
@@ -117,8 +122,9 @@ class AmplifierRating(_Rating):
     peak_volts : float, optional
         Voltage at which the amplifier clips. By default it follows from the power and its crest factor. Without a power,
         the power is that of the sine that peaks at this voltage.
-    volts_per_unit : float, default 1
-        Volts at the amplifier's output for a control signal of 1.
+    volts_per_unit : float, optional
+        Volts at the amplifier's output for a control signal of 1. If they are not known, 1 V is assumed, and a verdict
+        does not state watts.
 
     Raises
     ------
@@ -141,12 +147,11 @@ class AmplifierRating(_Rating):
     sine_watt: float | None = None
     noise_watt: float | None = None
     peak_volts: float | None = None
-    volts_per_unit: float = 1.0
+    volts_per_unit: float | None = None
 
     def __post_init__(self) -> None:
         as_positive(self.ohm, "ohm", unit="ohm")
-        as_positive(self.volts_per_unit, "volts_per_unit", unit="V")
-        self._check_optional(sine_watt="W", noise_watt="W", peak_volts="V")
+        self._check_optional(sine_watt="W", noise_watt="W", peak_volts="V", volts_per_unit="V")
         given = self._given("sine_watt", "noise_watt")
         if len(given) > 1 or (not given and self.peak_volts is None):
             raise ValueError(
@@ -163,7 +168,7 @@ class AmplifierRating(_Rating):
     def amplitude_limit(self) -> float:
         """Magnitude of the control signal at which the amplifier clips."""
         if self.peak_volts is not None:
-            return self.peak_volts / self.volts_per_unit
+            return self.peak_volts / self.volts
         crest = SINE_CREST if self.noise_watt is None else NOISE_CREST
         return crest * math.sqrt(self.rated_power)
 
@@ -205,8 +210,8 @@ class LoudspeakerRating(_Rating):
         Peak over rms of the displacement that is expected: sqrt(2) for a tone, 2 for noise that is clipped.
     thermal_window_s : float, default 10
         Time in seconds over which the mean power counts.
-    volts_per_unit : float, default 1
-        Volts at the loudspeaker for a control signal of 1.
+    volts_per_unit : float, optional
+        Volts at the loudspeaker for a control signal of 1, as for an `AmplifierRating`.
 
     Raises
     ------
@@ -243,13 +248,14 @@ class LoudspeakerRating(_Rating):
     displacement_mm_per_volt: Any = None
     excursion_crest_factor: float = NOISE_CREST
     thermal_window_s: float = THERMAL_WINDOW_S
-    volts_per_unit: float = 1.0
+    volts_per_unit: float | None = None
     _curve: tuple[np.ndarray, np.ndarray] | None = field(init=False, repr=False, compare=False, default=None)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ohm", float(np.min(as_curve(self.ohm, "ohm", "ohm")[1])))
-        self._check_optional(noise_watt="W", sine_watt="W", programme_watt="W", peak_volts="V", x_max_mm="mm")
-        for name in ("excursion_crest_factor", "thermal_window_s", "volts_per_unit"):
+        units = {"noise_watt": "W", "sine_watt": "W", "programme_watt": "W", "peak_volts": "V", "x_max_mm": "mm"}
+        self._check_optional(**units, volts_per_unit="V")
+        for name in ("excursion_crest_factor", "thermal_window_s"):
             as_positive(getattr(self, name), name)
         powers = self._given("noise_watt", "sine_watt", "programme_watt")
         if len(powers) > 1 or not (powers or self.peak_volts is not None or self.x_max_mm is not None):
@@ -276,7 +282,7 @@ class LoudspeakerRating(_Rating):
     @property
     def amplitude_limit(self) -> float | None:
         """Largest magnitude of the control signal, or None: a loudspeaker's watts do not limit its peaks."""
-        return None if self.peak_volts is None else self.peak_volts / self.volts_per_unit
+        return None if self.peak_volts is None else self.peak_volts / self.volts
 
     @property
     def limits(self) -> OutputLimits:
@@ -293,7 +299,7 @@ class LoudspeakerRating(_Rating):
             raise ValueError("displacement_mm needs a rating with displacement_mm_per_volt")
         y = as_signal(control_signal, "control_signal")
         frequencies = np.fft.rfftfreq(y.size, 1.0 / as_positive(fs, "fs", unit="Hz"))
-        response = np.interp(frequencies, *self._curve) * self.volts_per_unit
+        response = np.interp(frequencies, *self._curve) * self.volts
         return np.fft.irfft(np.fft.rfft(y) * response, y.size)
 
     def excursion_rated_power(self, control_signal: ArrayLike, fs: float) -> float:
@@ -354,7 +360,7 @@ def output_limits(rating: Rating | Sequence[Rating]) -> OutputLimits:
     ratings = list(rating) if isinstance(rating, list | tuple) else [rating]
     if not ratings:
         raise ValueError("rating must hold at least one rating, got none")
-    scales = {one.volts_per_unit for one in ratings if isinstance(one, AmplifierRating | LoudspeakerRating)}
+    scales = {one.volts for one in ratings if isinstance(one, AmplifierRating | LoudspeakerRating)}
     if len(scales) > 1:
         raise ValueError(
             f"all ratings must have the same volts_per_unit, got {', '.join(f'{scale:g}' for scale in sorted(scales))}: "
