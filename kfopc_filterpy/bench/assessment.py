@@ -33,7 +33,6 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult, __version__
 from kfopc_filterpy.bounds import SuggestedSettings
-from kfopc_filterpy.controllers.base import listed
 
 from .._types import NumberOrArray
 from .._writing import replacing_files
@@ -328,10 +327,10 @@ class Assessment:
 
 def _each(values: Any, form: str, unit: str = "", all_the_same: str = " each") -> str:
     """Return a number, or those of several loudspeakers, as text: "20 W", "20 W each" or "20, 10 W"."""
-    texts = [format(value, form) for value in np.ravel(values)]
+    texts = [format(float(format(value, form)), "g") for value in np.ravel(values)]  # 1250, not 1.25e+03
     if np.ndim(values) and len(set(texts)) == 1:
         return f"{texts[0]}{unit}{all_the_same if len(texts) > 1 else ''}"
-    return f"{listed(values, form)}{unit}"
+    return f"{', '.join(texts)}{unit}"
 
 
 def _db(value: float) -> str:

@@ -135,12 +135,13 @@ class _Page:
         self.controls = _controls(setups)
         self.sources, self.plots = _figures()
         self.texts = _texts()
-        self._is_running = self._is_filling = self._is_asked = self._is_new_setup = False
+        self._is_running = self._is_filling = self._is_asked = self._is_new_setup = self._is_closed = False
 
     def open(self) -> None:
         """Lay the page out, connect the controls, and start the first run."""
         from bokeh.layouts import column, gridplot, row
 
+        self.document.on_session_destroyed(self._close)
         left = column(*self.controls.values(), width=SIDE)
         rows = [[self.plots["spectrum"], self.plots["wave"]], [self.plots["level"], self.plots["power"]]]
         right = column(self.texts["summary"], gridplot(rows, toolbar_options={"logo": None}), self.texts["sounds"])
@@ -216,7 +217,14 @@ class _Page:
         self.texts["status"].text = "Computing …"
         start = time.perf_counter()
         future = self.pool.submit(explore, self.setup, self._settings())
-        future.add_done_callback(lambda done: self.document.add_next_tick_callback(partial(self._show, done, start)))
+        future.add_done_callback(partial(self._ended, start))
+
+    def _ended(self, start: float, done: Future[ExploreResult]) -> None:
+        if not self._is_closed:  # or else the server has given up the document
+            self.document.add_next_tick_callback(partial(self._show, done, start))
+
+    def _close(self, context: Any) -> None:
+        self._is_closed = True
 
     def _show(self, done: Future[ExploreResult], start: float) -> None:
         """Show a run that has ended, all at once; then start the one that was asked for meanwhile."""

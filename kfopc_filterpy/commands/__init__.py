@@ -11,7 +11,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from . import compare, data, explore, export, paths, run, verdict
+from . import compare, data, demo, explore, export, paths, run, verdict
 from .options import WRONG_INPUT, Parser
 
 EXAMPLES = """examples:
@@ -22,6 +22,7 @@ EXAMPLES = """examples:
   kfopc export controller.toml -o firmware --dtype float32
   kfopc explore
   kfopc data list
+  kfopc demo FOLDER
 each command has its own --help"""
 
 
@@ -60,6 +61,6 @@ def _parser() -> Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in (verdict, compare, paths, run, export, explore, data):
+    for module in (verdict, compare, paths, run, export, explore, data, demo):
         module.add_to(commands)
     return parser

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import statistics
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
@@ -282,3 +284,26 @@ def test_the_server_listens_on_this_machine_only(address):
         pytest.skip("needs /proc/net/tcp")
     listening = [line.split()[1] for line in lines.read_text().splitlines()[1:] if line.split()[3] == "0A"]
     assert [where.split(":")[0] for where in listening if int(where.split(":")[1], 16) == port] == ["0100007F"]
+
+
+LEFT = """
+import time
+from kfopc_filterpy.bench import exploring_page as page
+
+run = page.explore
+page.explore = lambda *settings: time.sleep(36) or run(*settings)  # longer than Bokeh waits for a tab that was left
+page.serve_explore(port=0, announce=lambda s: print(s, flush=True))
+"""
+
+
+@pytest.mark.slow
+def test_a_tab_that_is_left_before_its_run_ends_leaves_no_traceback():
+    with subprocess.Popen(
+        [sys.executable, "-c", LEFT], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as server:
+        urllib.request.urlopen(server.stdout.readline().split()[1]).read()
+        time.sleep(42.0)
+        server.send_signal(signal.SIGINT)
+        said, errors = server.communicate(timeout=PATIENCE_S)
+    assert said == "ended\n"
+    assert errors == ""
