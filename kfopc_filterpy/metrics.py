@@ -663,11 +663,11 @@ def a_weighted_level_db(
     >>> round(a_weighted_level_db(tone(100.0, 2.0, fs=16000, amplitude=2**0.5), 16000), 1)  # 1 Pa rms, 94.0 dB
     74.8
     """
-    signal, fs = _as_runs(signal, "signal", False)[0], as_positive(fs, "fs", unit="Hz")
-    length = signal.shape[-1]
+    x, fs = _as_runs(signal, "signal", False)[0], as_positive(fs, "fs", unit="Hz")
+    length = x.shape[-1]
     padded = 2 * length  # so that the end does not reach the beginning
     response = _a_response(np.fft.rfftfreq(padded, 1 / fs)) / np.abs(_a_response(np.array([1000.0])))
-    weighted = np.fft.irfft(np.fft.rfft(signal, padded) * response, padded)[..., :length]
+    weighted = np.fft.irfft(np.fft.rfft(x, padded) * response, padded)[..., :length]
     return _level_db(weighted, steady, reference)
 
 
@@ -718,14 +718,16 @@ def third_octave_levels_db(
     """
     from scipy.signal import butter, sosfilt
 
-    signal, fs = _as_runs(signal, "signal", False)[0], as_positive(fs, "fs", unit="Hz")
+    x, fs = _as_runs(signal, "signal", False)[0], as_positive(fs, "fs", unit="Hz")
     exact = 1000.0 * 10.0 ** (np.arange(-16, 14) / 10.0)
     low, high = exact * 10**-0.05, exact * 10**0.05
-    kept = (high < HIGHEST_BAND * fs) & ((high - low) * _steady_part(signal, steady).shape[-1] >= fs)
+    kept = (high < HIGHEST_BAND * fs) & ((high - low) * _steady_part(x, steady).shape[-1] >= fs)
     if not np.any(kept):
-        raise ValueError(f"signal must be longer for a third-octave band, got {signal.shape[-1]} samples at {fs:g} Hz")
-    filters = [butter(BAND_ORDER, edges, "bandpass", fs=fs, output="sos") for edges in zip(low[kept], high[kept], strict=True)]
-    levels = [_level_db(sosfilt(sections, signal), steady, reference) for sections in filters]
+        raise ValueError(f"signal must be longer for a third-octave band, got {x.shape[-1]} samples at {fs:g} Hz")
+    filters = [
+        butter(BAND_ORDER, edges, "bandpass", fs=fs, output="sos") for edges in zip(low[kept], high[kept], strict=True)
+    ]
+    levels = [_level_db(sosfilt(sections, x), steady, reference) for sections in filters]
     return exact[kept], np.stack(levels, axis=-1)
 
 

@@ -304,7 +304,10 @@ def _checks(verdict: Assessment) -> list[tuple[str, str]]:
         ),
         ("Power for full control", verdict.power(verdict.unlimited_power)),
         (f"Least power for {verdict.want_db:g} dB, best fixed filter", _or_none(verdict, verdict.required_rated_power)),
-        (f"Least power for {verdict.want_db:g} dB, {verdict.algorithm}, found by runs", _or_none(verdict, verdict.least_rated_power)),
+        (
+            f"Least power for {verdict.want_db:g} dB, {verdict.algorithm}, found by runs",
+            _or_none(verdict, verdict.least_rated_power),
+        ),
         (
             "Causality",
             "unknown without a primary path"

@@ -40,7 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 done or enough, 1 not enough or stopped by a fault, 2 wrong input, 130 interrupted.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    options, unknown = _parser().parse_known_args(arguments, argparse.Namespace(command=shlex.join(["kfopc", *arguments])))
+    options, unknown = _parser().parse_known_args(
+        arguments, argparse.Namespace(command=shlex.join(["kfopc", *arguments]))
+    )
     try:
         if unknown:
             raise ValueError(f"unrecognized arguments: {' '.join(unknown)}; see {options.prog} --help")

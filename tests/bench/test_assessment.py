@@ -279,7 +279,9 @@ def test_the_json_is_strict_and_as_its_schema_says(written):
 def test_the_page_says_where_it_comes_from_and_no_watts_that_are_not_known(tmp_path):
     options: dict = {"fs": FS, "n_taps": TAPS, "beside": (), "want_db": 1.0}
     known, unknown = (
-        assess(noise(), arriving(20), arriving(6, length=16), rating=AmplifierRating(8.0, 2.0, volts_per_unit=v), **options)
+        assess(
+            noise(), arriving(20), arriving(6, length=16), rating=AmplifierRating(8.0, 2.0, volts_per_unit=v), **options
+        )
         for v in (4.0, None)
     )
     pages = []
@@ -290,7 +292,11 @@ def test_the_page_says_where_it_comes_from_and_no_watts_that_are_not_known(tmp_p
     assert "Power (W into 8 ohm)" in pages[0]
     assert "of 1 is 4 V" in pages[0]
     assert not re.search(r"\d W\b|\(W", re.sub(r"data:[^\"]*", "", pages[1]))
-    for told in ("not watts: volts_per_unit is not known", "of 1 is an unknown voltage", "&lt;a&gt;.wav, 24000 samples"):
+    for told in (
+        "not watts: volts_per_unit is not known",
+        "of 1 is an unknown voltage",
+        "&lt;a&gt;.wav, 24000 samples",
+    ):
         assert told in pages[1]
     for told in (f"kfopc_filterpy {__version__}", str(date.today()), "8000 Hz", "in a run of 2.7 s"):
         assert told in pages[0]
