@@ -46,7 +46,7 @@ def require_page() -> None:
 def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Path:
     """Write the page, the figures, the sounds and verdict.json into a folder; return the path of the page."""
     require_page()
-    path = prepare_folder(folder)
+    path, volts = prepare_folder(folder), verdict.volts_per_unit
     study = StudyReport(
         "verdict",
         "Verdict",
@@ -73,8 +73,9 @@ def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Pat
         origin={
             **verdict.origin,
             "Sample rate": f"{verdict.fs:g} Hz",
-            "Control signal": "of 1 is "
-            + ("an unknown voltage" if verdict.volts_per_unit is None else f"{listed(verdict.volts_per_unit, 'g')} V"),
+            "Volts for a control signal of 1": "not known, taken as 1 V"
+            if volts is None
+            else f"{listed(volts, 'g')} V",
             "Version": f"kfopc_filterpy {__version__}",
             "Date": datetime.now().astimezone().isoformat(" ", "minutes"),
         },

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
+import shlex
 from inspect import signature
+from pathlib import Path
 
 import jsonschema
 import numpy as np
@@ -16,9 +19,12 @@ from helpers.commands import FS, SCENE, process
 from kfopc_filterpy import bench
 from kfopc_filterpy.bench import assess
 from kfopc_filterpy.bench.assessment import SCHEMA
+from kfopc_filterpy.commands import main
 from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.signals import band_limited_noise, write_wav
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_a_process_ends_with_0_if_the_amplifier_is_enough_and_writes_what_it_says(folder, tmp_path):
@@ -33,6 +39,36 @@ def test_a_process_ends_with_0_if_the_amplifier_is_enough_and_writes_what_it_say
     assert data["enough"] is True
     assert data["rating"]["rated_power"] == pytest.approx(10 * 8 / 16)
     assert data["levels"]["before_dba"] > data["levels"]["after_dba"]
+    assert data["origin"]["Command"] == shlex.join(
+        ["kfopc", "verdict", *SCENE, *rating, "--taps", "32", "-o", str(out)]
+    )
+    assert data["origin"]["Files"].startswith("noise.wav, 24000 samples at 8000 Hz; P.wav, 64 taps at 8000 Hz; S.wav")
+
+
+def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(tmp_path, monkeypatch, capsys):
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    start = next(number for number, line in enumerate(lines) if "kfopc demo" in line and line.startswith(".venv"))
+    _, write, folder = lines[start].split(" && ")[0].split()
+    monkeypatch.chdir(tmp_path)
+    assert main([write, folder]) == 0
+    assert lines[start].endswith(f" && cd {folder}")
+    monkeypatch.chdir(folder)
+    pasted = lines[start + 1].split()
+    assert pasted[0] == "../.venv/bin/kfopc"
+    assert main(pasted[1:]) == 0
+    assert Path("out", "verdict.html").is_file()
+    watt = re.search(r"About (\S+) W into 8 ohm would do", capsys.readouterr().out)[1]
+    typed_back = " ".join(pasted[1:-2]).replace("--watt 50", f"--watt {watt}").replace("--primary P", "--disturbance d")
+    assert main(typed_back.split()) == 0  # d.wav is what P.wav makes of noise.wav, and some noise of the microphone
+    assert main(["demo", "."]) == 2
+    assert "S.wav would be overwritten: choose another folder" in capsys.readouterr().err
+
+
+def test_watts_without_volts_are_not_stated_and_the_terminal_says_why(command):
+    _, out, err = command("verdict", *SCENE, "--watt", "1", "--ohm", "8", "--taps", "16", "--algorithm", "FxLMS")
+    assert "with a rated power of 8," in out
+    assert " W" not in out
+    assert "not watts: volts_per_unit is not known, and taken as 1 V" in err
 
 
 def test_a_process_ends_with_1_if_it_is_not_and_reads_its_standard_input(folder):
@@ -209,7 +245,7 @@ def test_several_channels_are_read_in_the_order_that_the_help_states(command, se
 
 def test_the_exit_code_is_that_of_all_amplifiers_together(command, several):
     files = ["noise.wav", "--disturbance", "errors.wav", "--secondary", "S1.wav", "--secondary", "S2.wav"]
-    options = ["--ohm", 8, "--taps", 32, "--quiet", "--algorithm", "KF-PB"]
+    options = ["--ohm", 8, "--volts-per-unit", 1, "--taps", 32, "--quiet", "--algorithm", "KF-PB"]
     code, out, _ = command("verdict", *files, "--watt", 1, *options)
     assert code == 0
     assert out.startswith("Enough: KF-PB reaches")
