@@ -160,6 +160,9 @@ def _bound(verdict: Assessment) -> Any:
     ax.semilogx(scale * powers, reached, color="0.2", label="best fixed filter")
     rated = 1.0 if several else scale * verdict.limits.rated_power
     ax.axvline(rated, color="0.2", linestyle="--", label="rated power")
+    least = rated * np.max(verdict.least_rated_power / verdict.limits.rated_power)
+    if 0 < least <= right:
+        ax.axvline(least, color="0.5", linestyle="-.", label=f"least for {verdict.algorithm}")
     ax.axhline(verdict.want_db, color="0.5", linestyle=":", label="wanted")
     for name, figures in verdict.figures.items():
         own = figures["noise_reduction_db"]
