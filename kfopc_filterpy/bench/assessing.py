@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -130,8 +129,8 @@ def assess(
     Raises
     ------
     TypeError, ValueError
-        Signals that are not finite, silent, too short for the filter or for a run of 2 s, or of different lengths; paths whose channels do not
-        fit the signals; neither a primary path nor a disturbance; a rating that does not limit the mean power, or ratings
+        Signals that are not finite, silent, too short for the filter or for a run of 2 s, or of different lengths; paths
+        whose channels do not fit the signals; neither a primary path nor a disturbance; a rating that does not limit the mean power, or ratings
         for another number of loudspeakers; an unknown algorithm.
 
     Notes
@@ -381,8 +380,8 @@ def _least_share(plan: Plan, name: str, want_db: float, start: float, unit: floa
         power = float(f"{np.exp(log_power):.3g}")
         if power not in tried:
             announce(plan.bar, plan.planned_samples(name), "least rating")
-            run = plan.run(name, limited=True, share=power / unit)
-            tried[power] = max(_reduction(run) - want_db, -sys.float_info.max)
+            reached = _reduction(plan.run(name, limited=True, share=power / unit))
+            tried[power] = max(reached, -100.0) - want_db  # a number if it diverged, too
         return tried[power]
 
     low = high = np.log(start * unit)

@@ -32,8 +32,8 @@ def demo(options: argparse.Namespace) -> int:
     sound = compressor_noise(SECONDS, fs=FS, rng=7, power=2.0**2)  # in Pa
     primary = path_taps(duct.primary)
     signals = {
-        "noise": sound,
-        "d": np.convolve(sound, primary)[: sound.size],
+        "noise": sound + MICROPHONE_NOISE * rng.standard_normal(sound.size),
+        "d": np.convolve(sound, primary)[: sound.size] + MICROPHONE_NOISE * rng.standard_normal(sound.size),
         "P": primary,
         "S": VOLTS_PER_UNIT * PASCAL_PER_VOLT * path_taps(duct.secondary),
     }
@@ -42,8 +42,7 @@ def demo(options: argparse.Namespace) -> int:
         raise FileExistsError(f"{', '.join(there)} would be overwritten: choose another folder")
     options.folder.mkdir(parents=True, exist_ok=True)
     for path, signal in files.items():
-        recorded = path.stem in ("noise", "d")
-        write_wav(path, signal + (MICROPHONE_NOISE * rng.standard_normal(signal.size) if recorded else 0.0), FS)
+        write_wav(path, signal, FS)
     noise, d, primary_file, secondary_file = files
     print(f"{noise}, {d}, {primary_file} and {secondary_file} written. For example:")
     print(
