@@ -130,8 +130,8 @@ def assess(
     ------
     TypeError, ValueError
         Signals that are not finite, silent, too short for the filter or for a run of 2 s, or of different lengths; paths
-        whose channels do not fit the signals; neither a primary path nor a disturbance; a rating that does not limit the mean power, or ratings
-        for another number of loudspeakers; an unknown algorithm.
+        whose channels do not fit the signals; neither a primary path nor a disturbance; a rating that does not limit the
+        mean power, or ratings for another number of loudspeakers; an unknown algorithm.
 
     Notes
     -----
