@@ -160,7 +160,7 @@ def test_processes_that_write_one_folder_do_not_fail_and_do_not_mix(tmp_path):
 
 
 def test_an_interrupted_verdict_leaves_the_folder_as_it_was(tmp_path):
-    noise = np.random.default_rng(0).standard_normal(2 * FS)
+    noise = np.random.default_rng(0).standard_normal(6 * FS)
     for name, samples in {"noise": noise, "P": np.eye(64)[26], "S": np.eye(64)[12]}.items():
         write_wav(tmp_path / f"{name}.wav", samples, FS)
     (tmp_path / "out").mkdir()

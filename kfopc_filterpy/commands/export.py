@@ -127,7 +127,7 @@ def _made(make: Callable[..., Any], settings: dict[str, Any], fs: float | None, 
     known = inspect.signature(make).parameters
     if unknown := ", ".join(settings.keys() - known.keys()):
         raise ValueError(f"{where}: there is no setting {unknown}, but {', '.join(known)}")
-    rate = {"fs": fs} if fs and "fs" in known else {}
+    rate = {"fs": fs} if fs and "fs" in known and "constraint" not in settings else {}  # a constraint has its own
     try:
         return make(**rate | settings)
     except (TypeError, ValueError) as error:

@@ -131,6 +131,7 @@ def test_a_controller_that_python_saved_goes_on(command, folder, tmp_path):
     assert same_as_of_python(controller, tmp_path / "out", tmp_path)
 
 
+@pytest.mark.slow  # zig compiles for two systems
 def test_an_fmu_is_that_of_python(command, folder, tmp_path):
     pytest.importorskip("ziglang", reason="zig compiles the libraries")
     (folder / "c.toml").write_text(described(algorithm="FxLMS", n_taps=8, secondary_path="S.wav", step_size=0.01))

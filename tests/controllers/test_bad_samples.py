@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from kfopc_filterpy import KFOPC, FxLMS, FxNLMS, OutputLimiter, fx_rls, simulate
 from kfopc_filterpy.signals import band_limited_noise, tone
 
-UNUSABLE = [np.nan, np.inf, -1e160, 1e308, "1.0", np.ma.masked, np.datetime64("2020-01-01")]
+LOUD = [-1e160, 1e308]
+UNUSABLE = [np.nan, np.inf, *LOUD, "1.0", np.ma.masked, np.datetime64("2020-01-01")]
 HUGE = [1e12, -1e24, 1e49]
 FS = 8000
 S = np.array([0.0, 0.0, 0.0, 0.8, 0.0, -0.2])
@@ -53,7 +54,8 @@ def test_a_refused_sample_leaves_the_saved_state_as_it_was(name: str, half: str,
     room = Room(controller)
     before, refused = bad_sample(controller, room, half, value, samples)
     if refused is None:
-        assert not any(value is one for one in UNUSABLE), "it was taken"
+        taken_by_users_own = name == "LimitedController" and value in LOUD
+        assert taken_by_users_own or not any(value is one for one in UNUSABLE), "it was taken"
         return
     assert contents(controller) == contents(before)
     if half == "update":

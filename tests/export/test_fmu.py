@@ -20,6 +20,7 @@ from kfopc_filterpy import FxLMS, OutputLimiter, OutputPowerConstraint, kf_opc, 
 from kfopc_filterpy.export import Float32Controller, export_fmu
 
 pytest.importorskip("ziglang", reason="zig compiles for both systems")
+pytestmark = pytest.mark.slow  # zig compiles for two systems
 FS, SAMPLES = 8000, 2000
 PATH = np.array([0.0, 0.8, 0.3, -0.1])
 PATHS, PRIMARY = random_paths(2, 2, 4, seed=1), random_paths(2, 2, 12, seed=2, delay=4)
@@ -232,7 +233,6 @@ int main(int argc, char **argv) /* the unit's library and its token; x(n) and e(
 """
 
 
-@pytest.mark.slow
 def test_the_library_for_windows_has_the_bits_of_python(opened, tmp_path):
     """A small host loads it, in wine. The error is an input of the next step."""
     wine, unit = tool("wine", "wine"), opened()

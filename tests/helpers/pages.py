@@ -43,8 +43,8 @@ class Page:
 
     def skip(self, to: str) -> None:
         """Leave out the cells before the heading `to`."""
-        while self._left[0]["heading"] != to:
-            self._left.pop(0)
+        while self.left[0]["heading"] != to:
+            self.left.pop(0)
 
     def run(self, until: str | None = None) -> Any:
         """Run the cells before the heading `until`, by default all that are left; return the variables."""
