@@ -11,8 +11,6 @@ import numpy as np
 from .._validate import as_count, as_positive
 from .interfaces import Block
 
-SILENT_S = 5.0  # without a block: the device is gone
-
 
 class SoundDevice:
     """A sound card: microphones at some of its inputs, loudspeakers at some of its outputs.
@@ -43,6 +41,8 @@ class SoundDevice:
     ----------
     full_scale : float
         1, the largest value of a sample.
+    patience_s : float
+        Seconds without a block after which `read` gives the device up, 5 unless another is assigned.
     dry : int
         Blocks that came too late for the output: silence was played in their place.
 
@@ -61,6 +61,7 @@ class SoundDevice:
     """
 
     full_scale = 1.0
+    patience_s = 5.0
 
     def __init__(
         self,
@@ -122,10 +123,10 @@ class SoundDevice:
     def read(self) -> Block | None:
         """Return the next block; a block is counted as lost if the driver reports that the input overflowed."""
         try:
-            heard, overflowed = self._heard.get(timeout=SILENT_S)
+            heard, overflowed = self._heard.get(timeout=self.patience_s)
         except Empty:
             raise RuntimeError(
-                f"no block came from the sound card for {SILENT_S:g} s: was it unplugged, or its server stopped?"
+                f"no block came from the sound card for {self.patience_s:g} s: was it unplugged, or its server stopped?"
             ) from None
         signals = heard.T.astype(np.float64)
         return Block(signals[self._references], signals[self._errors], self.block if overflowed else 0)

@@ -472,10 +472,10 @@ def test_a_block_that_comes_too_late_is_left_out_and_the_next_is_in_time(plugged
     device.stop()
 
 
-def test_a_card_that_is_gone_is_an_error(plugged: Callable[..., Card], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_card_that_is_gone_is_an_error(plugged: Callable[..., Card]) -> None:
     plugged()
-    monkeypatch.setattr("kfopc_filterpy.realtime.sound_device.SILENT_S", 0.01)
     device = SoundDevice([2], [3], [1], fs=FS, block=32)
+    device.patience_s = 0.01
     device.start()
     with pytest.raises(RuntimeError, match="no block came from the sound card"):
         device.read()
