@@ -25,7 +25,7 @@ README_COMMANDS = [
     f'{SET_UP} ".[studies]" && .venv/bin/python -m comparisons',
     f'{SET_UP} ".[docs]" && .venv/bin/python -m sphinx -W -j auto docs docs/_build/html',
 ]
-NOT_FOR_TESTS = ("bench", "docs", "realtime")  # extras that the tests run without
+NOT_FOR_TESTS = ("bench", "docs", "fmu", "realtime")  # extras that the tests run without
 LOADED_WHEN_FIRST_USED = ("control", "h5py", "matplotlib", "pooch", "pyuff", "soundfile", "tqdm")
 
 

@@ -45,6 +45,7 @@ def test_a_process_ends_with_0_if_the_amplifier_is_enough_and_writes_what_it_say
     assert data["origin"]["Files"].startswith("noise.wav, 24000 samples at 8000 Hz; P.wav, 64 taps at 8000 Hz; S.wav")
 
 
+@pytest.mark.slow
 def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(tmp_path, monkeypatch, capsys):
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     start = next(number for number, line in enumerate(lines) if "kfopc demo" in line and line.startswith(".venv"))

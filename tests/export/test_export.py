@@ -185,8 +185,16 @@ def test_every_algorithm_of_the_core_is_tested_here():
     assert tested == defined - {"signals_alone", "observer"}  # these have no exported controller
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [
+        *((name, "float64") for name in CONTROLLERS),
+        *(
+            pytest.param(name, "float32", marks=() if name.endswith("everything") else pytest.mark.slow)
+            for name in CONTROLLERS
+        ),
+    ],
+)
 def test_the_bits_are_those_of_python(name, dtype, tmp_path):
     trained, result = trained_and_run(name)
     if dtype == "float32":

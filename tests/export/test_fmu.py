@@ -7,11 +7,8 @@ import shutil
 import subprocess
 from xml.etree import ElementTree
 
-import fmpy
 import numpy as np
 import pytest
-from fmpy.fmi3 import FMU3Slave
-from fmpy.validation import validate_fmu
 from helpers.c99 import WARNINGS, compiler, succeeds
 from helpers.channels import random_paths
 from helpers.core import tool, zig
@@ -19,6 +16,9 @@ from helpers.core import tool, zig
 from kfopc_filterpy import FxLMS, OutputLimiter, OutputPowerConstraint, kf_opc, kf_pb, simulate
 from kfopc_filterpy.export import Float32Controller, export_fmu
 
+fmpy = pytest.importorskip("fmpy", reason="needs FMPy (the extra `fmu`)")
+for part in ("fmpy.fmi3", "fmpy.validation"):
+    pytest.importorskip(part)
 pytest.importorskip("ziglang", reason="zig compiles for both systems")
 pytestmark = pytest.mark.slow  # zig compiles for two systems
 FS, SAMPLES = 8000, 2000
@@ -45,7 +45,7 @@ class Unit:
         self.time, self.error = 0.0, []
 
     def opened(self, token=None):
-        slave = FMU3Slave(
+        slave = fmpy.fmi3.FMU3Slave(
             guid=token or self.described.guid,
             unzipDirectory=self.folder,
             modelIdentifier=self.described.coSimulation.modelIdentifier,
@@ -117,7 +117,7 @@ def run(controller, several=False, samples=SAMPLES):
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_a_unit_is_valid_and_has_the_bits_of_python_on_the_plant_of_simulate(name, dtype, units, opened):
-    assert validate_fmu(str(units(name, dtype))) == []
+    assert fmpy.validation.validate_fmu(str(units(name, dtype))) == []
     controller = CONTROLLERS[name]()
     several = controller.multichannel
     result = run(opened(name, dtype), several)

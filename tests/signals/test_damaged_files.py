@@ -272,7 +272,10 @@ print(time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN).ru_
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and measured on Linux only")
 @pytest.mark.parametrize(
     ("change", "message"),
-    [("size", "its library ended .* or took longer than 10 s"), ("length", "memory allocation failed")],
+    [
+        pytest.param("size", "its library ended .* or took longer than 10 s", marks=pytest.mark.slow),
+        ("length", "memory allocation failed"),
+    ],
 )
 def test_what_leads_libhdf5_astray_ends_in_time_and_within_the_memory(change, message, tmp_path):
     """The size of an object in the global heap becomes 0, which is a loop; the length of an attribute, which is 4.1 GB."""
