@@ -1,7 +1,7 @@
 """`python -m comparisons board`: exported controllers on an emulated Cortex-M4, and what they would need of a real one.
 
 Each controller is exported in float32, compiled for the board and for this machine, and run on both in the same loop. Both
-must give the same bits. The emulator counts instructions, not cycles: no board was touched.
+must give the same bits. The emulator counts instructions, not cycles; no real board is used.
 """
 
 from __future__ import annotations

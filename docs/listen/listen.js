@@ -86,7 +86,7 @@
   }
 
   function prepared(signals) {
-    if (!LISTEN.rates[signals.fs]) throw new Error(`${signals.fs} Hz is not among ${Object.keys(LISTEN.rates).join(", ")} Hz.`);
+    if (!LISTEN.rates[signals.fs]) throw new Error(`${signals.fs} Hz is not among the sample rates of this page: ${Object.keys(LISTEN.rates).join(", ")} Hz.`);
     return { ...signals, powers: measured(signals) };
   }
 
@@ -119,8 +119,8 @@
     <p id="listen-said" role="status"></p>
     <details><summary>Your own noise and impulse responses</summary>
       ${["noise", "primary", "secondary"].map((name) => `<label>${name === "noise" ? "Noise at the reference" : `${name[0].toUpperCase() + name.slice(1)} path`} <input type="file" accept=".wav" id="listen-${name}"></label>`).join("<br>")}
-      <p>WAV files of one sample rate; the first channel counts. Without impulse responses, the built-in duct's are taken at the
-      noise's rate. Nothing leaves this page.</p></details>`;
+      <p>WAV files with the same sample rate; the first channel counts. Without impulse responses, those of the built-in duct are used,
+      as if sampled at the noise's rate. Nothing leaves this page.</p></details>`;
   const at = (name) => document.getElementById(`listen-${name}`);
   const said = (text) => { at("said").textContent = text; };
   place.querySelector('input[value="KF-OPC"]').checked = true;
@@ -238,8 +238,8 @@
       }
       const duct = builtIn(), fs = (files.noise ?? files.primary ?? files.secondary ?? duct).fs;
       for (const [name, file] of Object.entries(files))
-        if (file.fs !== fs) throw new Error(`The ${name} file has ${file.fs} Hz, another one ${fs} Hz: resample it.`);
-      if (!files.noise && fs !== duct.fs) throw new Error(`Give a noise of ${fs} Hz too: the built-in one has ${duct.fs} Hz.`);
+        if (file.fs !== fs) throw new Error(`The ${name} file is sampled at ${file.fs} Hz, another one at ${fs} Hz: resample it.`);
+      if (!files.noise && fs !== duct.fs) throw new Error(`Give a noise sampled at ${fs} Hz too: the built-in one is sampled at ${duct.fs} Hz.`);
       for (const name of ["primary", "secondary"])
         if (files[name]?.samples.length > 2048) throw new Error(`The ${name} path has more than 2048 samples: cut off its end.`);
       const taken = (name) => files[name]?.samples ?? duct[name];

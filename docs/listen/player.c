@@ -45,7 +45,7 @@ real *EXPORTED(player_buffer)(int which)
 
 real EXPORTED(player_number)(int which) { return sums[which]; }
 
-/* The amplifier clips at twice the root of the rated power. A controller that knows of the rating keeps it. */
+/* The amplifier clips at twice the root of the rated power. A controller that knows the rating keeps it. */
 void EXPORTED(player_rate)(real rated)
 {
     amplifier = (anc_amplifier){ANC_HARD_CLIP, 2 * root(rated), 1};

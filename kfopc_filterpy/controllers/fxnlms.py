@@ -15,8 +15,8 @@ class FxNLMS(CoreController):
 
     .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{x'(n)^T x'(n)}
 
-    One step size therefore suits soft and loud noise. In a quiet passage, the energy counts as a thousandth of the usual
-    one at least; otherwise the weights would follow the noise of the microphones. The usual energy is that of the last
+    One step size therefore suits soft and loud noise. In a quiet passage, the energy counts as at least a thousandth of
+    the usual one; otherwise the weights would follow the noise of the microphones. The usual energy is that of the last
     thousand filter lengths. With several channels, the steps of all filters are divided by
     the same energy, that of all filtered references together. So their direction remains that of the multiple-error
     LMS:

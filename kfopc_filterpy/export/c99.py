@@ -44,7 +44,7 @@ class CExport:
     dtype : str
         float64 (C's double) or float32 (float).
     n_bytes : int
-        Size of the state, ``sizeof(<name>_state)`` with natural alignment, where a pointer has 8 bytes.
+        Size of the state, ``sizeof(<name>_state)`` with natural alignment, if a pointer has 8 bytes.
 
     Examples
     --------

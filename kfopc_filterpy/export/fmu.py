@@ -68,7 +68,7 @@ def export_fmu(
     ModuleNotFoundError
         FMPy, from which the headers of the standard are taken, is not installed: it is part of the extra `fmu`.
     RuntimeError
-        There is no zig, which compiles for both systems and is part of the extra too.
+        zig, which compiles for both systems and is part of the extra too, is not installed.
 
     Examples
     --------

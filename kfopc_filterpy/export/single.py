@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Float32Controller:
-    """A controller that computes what its export in float32 computes, to the bit, for `simulate`.
+    """A controller that computes in `simulate` what its export in float32 computes, bit for bit.
 
     It shows what single precision changes before anything is embedded. References and errors are rounded to float32, as
     converters would give them.
@@ -71,4 +71,6 @@ class Float32Controller:
 
     def _require(self, answer: int) -> None:
         if answer:
-            raise ValueError(f"{reason_of(answer)} (in float32, 1e12 and 1e6); nothing was changed")
+            raise ValueError(
+                f"{reason_of(answer)} (in float32: 1e6 for 1e25 and 1e50, 1e12 for 1e100); nothing was changed"
+            )

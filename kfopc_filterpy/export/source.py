@@ -45,7 +45,7 @@ class Exported:
 
     @property
     def n_bytes(self) -> int:
-        """Size of the state where a pointer has 8 bytes."""
+        """Size of the state if a pointer has 8 bytes."""
         return self.block.memory.size + (_VIEW_PLACES + 2) * _POINTER
 
     def filled(self, template: str, **values: Any) -> str:

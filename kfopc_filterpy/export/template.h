@@ -8,7 +8,7 @@
  *         $statement    x(n) from the reference microphone$s, y(n) to the amplifier$s
  *         ${name}_update(&state, e);    e(n) = d(n) - (s * y)(n) from the error microphone$s
  *
- * The state has $n_bytes bytes where a pointer has 8. No heap is used, and there is no state elsewhere.
+ * The state has $n_bytes bytes if a pointer has 8. No heap is used, and there is no state elsewhere.
  *
  * Compile with these flags, and the result has the bits of kfopc_filterpy's core in $real, on every machine:
  *     $flags

@@ -65,7 +65,7 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except that
     arguments that would corrupt that filter (NaN, Inf, complex numbers, a wrong shape, a negative variance, a P that is
-    not positive semidefinite) raise an error before anything changes. The page "What differs from filterpy" lists all.
+    not positive semidefinite) raise an error before anything changes. The page "What differs from filterpy" lists them.
     `F` and `H` may be nested lists, which are stored as arrays.
 
     Parameters

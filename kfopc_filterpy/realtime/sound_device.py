@@ -34,8 +34,8 @@ class SoundDevice:
     latency : float or {"low", "high"}, default "low"
         What sounddevice is asked for. `measure_round_trip` measures what came of it.
     ahead : int, default 2
-        Blocks of silence that are played first. So many blocks after it was heard, a block is played, besides the delay of
-        the device.
+        Blocks of silence that are played first. The control signal is late by so many blocks, besides the delay of the
+        device.
 
     Attributes
     ----------

@@ -1,7 +1,7 @@
-"""Reads a file in a process of its own, whose time and memory are limited: a library that a file can lead astray.
+"""Reads a file in a process of its own, whose time and memory are limited, because a damaged file can hang a library.
 
-libhdf5 loops for ever, or takes gigabytes, if a few bytes of a file are changed, and nothing within its process can stop
-it. It costs 0.2 s. Its memory can be limited on Linux only.
+libhdf5 can loop for ever, or take gigabytes, if a few bytes of a file are changed, and nothing within its process can stop
+it. The process costs 0.2 s. Its memory can be limited on Linux only.
 """
 
 from __future__ import annotations

@@ -515,7 +515,7 @@ def test_a_filterpy_use_gives_the_same_bits(scenario: Callable[[type], list]) ->
 
 def test_the_page_lists_these_uses() -> None:
     page = (ROOT / "docs" / "filterpy.md").read_text(encoding="utf-8")
-    assert [row[0] for row in table_of(page, "What takes a filter, or stands beside one")] == list(USES)
+    assert [row[0] for row in table_of(page, "Parts of filterpy that were compared")] == list(USES)
 
 
 def test_the_imm_of_the_fork_runs_KFOPCs() -> None:
