@@ -125,6 +125,7 @@ def move(browser: Any, name: str, selector: str, sent: str | None) -> float:
     return browser.execute_script("return times.followed - times.moved") / 1000
 
 
+@pytest.mark.slow
 def test_every_slider_changes_the_curves_within_a_second(address, browser, tmp_path):
     browser.get(address)
     wait_until(lambda: browser.execute_script("return window.Bokeh?.documents.length > 0"), "the page was open")
@@ -155,6 +156,7 @@ def test_every_slider_changes_the_curves_within_a_second(address, browser, tmp_p
     assert not [message for message in severe if "favicon" not in message]
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_run_of_its_sliders_and_plays_it(address, browser):
     browser.get(address)
     wait_until(lambda: browser.execute_script("return window.Bokeh?.documents.length > 0"), "the page was open")
@@ -177,6 +179,7 @@ def test_the_page_shows_the_run_of_its_sliders_and_plays_it(address, browser):
         assert length == pytest.approx(3.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_fixed_rating_stays_while_the_noise_gets_louder(address, browser):
     browser.get(address)
     wait_until(lambda: browser.execute_script("return window.Bokeh?.documents.length > 0"), "the page was open")

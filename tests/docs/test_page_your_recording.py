@@ -52,6 +52,7 @@ def test_the_figures_say_what_the_page_says():
     assert len(v.run.error) == len(v.small.runs["KF-PB"].error)
 
 
+@pytest.mark.slow
 def test_it_runs_on_the_files_of_someone_else(inside, capsys):
     """Integers in stereo at 48 kHz, another length, another duct, and impulse responses of other rates and lengths."""
     folder = inside / "recordings"
