@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from contextlib import chdir
 
 import numpy as np
 import pytest
@@ -425,9 +426,9 @@ def slope(scenario):
 @pytest.fixture
 def module(tmp_path, monkeypatch):
     (tmp_path / "own_sweep_module.py").write_text(OWN_MODULE)
-    monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    return "own_sweep_module:slope"
+    with chdir(tmp_path):
+        yield "own_sweep_module:slope"
 
 
 def sweep_command(*arguments):
