@@ -51,7 +51,8 @@ class SoundDevice:
     ImportError
         sounddevice or the PortAudio library is missing.
     ValueError
-        No channels, a negative one, or one that is both a reference and an error.
+        No channels, a negative one, or one that is both a reference and an error; at the start, a card that cannot be
+        opened.
 
     Examples
     --------
@@ -98,15 +99,20 @@ class SoundDevice:
         for _ in range(self.ahead):
             self._played.put(np.zeros((self.block, max(self._outputs) + 1), dtype=np.float32))
         # not `read` and `write` of PortAudio, which crash with JACK
-        self._stream = sounddevice.Stream(
-            samplerate=self.fs,
-            blocksize=self.block,
-            device=self.device,
-            channels=(max(self._references + self._errors) + 1, max(self._outputs) + 1),
-            dtype="float32",
-            latency=self.latency,
-            callback=self._exchange,
-        )
+        try:
+            self._stream = sounddevice.Stream(
+                samplerate=self.fs,
+                blocksize=self.block,
+                device=self.device,
+                channels=(max(self._references + self._errors) + 1, max(self._outputs) + 1),
+                dtype="float32",
+                latency=self.latency,
+                callback=self._exchange,
+            )
+        except sounddevice.PortAudioError as error:
+            raise ValueError(
+                f"the sound card cannot be opened: {error}. `python -m sounddevice` lists the devices and their channels"
+            ) from error
         self._stream.start()
 
     def _exchange(self, heard: np.ndarray, played: np.ndarray, frames: int, times: Any, status: Any) -> None:

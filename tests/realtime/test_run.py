@@ -481,6 +481,15 @@ def test_a_card_that_is_gone_is_an_error(plugged: Callable[..., Card]) -> None:
         device.read()
 
 
+def test_a_card_that_cannot_be_opened_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stream(**asked: Any) -> None:
+        raise OSError("Error querying device -1")
+
+    monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=stream, PortAudioError=OSError))
+    with pytest.raises(ValueError, match=r"cannot be opened: Error querying device -1.* lists the devices"):
+        SoundDevice([0], [1]).start()
+
+
 def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(uninstall: Callable[[str], None]) -> None:
     device = SoundDevice([0], [1])
     uninstall("sounddevice")
