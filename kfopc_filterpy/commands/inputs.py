@@ -142,20 +142,18 @@ class Files:
 
     def _chosen(self, path: str, source: str, is_path: bool, fs: float | None) -> Recording:
         """Return the channels of a file that its argument or the options choose, at a rate."""
-        from ..paths import read_path
-        from ..signals import read_recording
-        from ..signals.recordings import read_content
+        from ..paths.reading import path_of
+        from ..signals.recordings import read_content, recording_of
 
-        variable = _named(path).variable or self.options.variable
-        file_fs = None
-        if read_content(source, variable=variable).fs is None:
+        content, file_fs = read_content(source, variable=_named(path).variable or self.options.variable), None
+        if content.fs is None:
             file_fs, self._without_rate = self.options.file_fs, True
             if file_fs is None:
                 raise ValueError(
                     f"{path} states no sampling rate: give the rate in Hz at which it was sampled, for example with "
                     "--file-fs 48000 (--fs is the rate to which files are resampled)"
                 )
-        read = (read_path if is_path else read_recording)(source, fs=fs, file_fs=file_fs, variable=variable)
+        read = (path_of if is_path else recording_of)(source, content, fs, file_fs)
         return _with_channel(read, path, self.options.channel)
 
     def _require_new(self, path: str, n_channels: int) -> None:

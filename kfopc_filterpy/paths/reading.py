@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .._validate import as_rate_ratio
-from ..signals.content import require_room
+from ..signals.content import Content, require_room
 from ..signals.recordings import Recording, rates_of, read_content, scaled
 from .resampling import resample_path
 
@@ -82,6 +82,18 @@ def read_path(
     0.75
     """
     content = read_content(path, channel=channel, variable=variable)
+    return path_of(path, content, fs, file_fs, unit, unit_per_full_scale)
+
+
+def path_of(
+    path: str | os.PathLike[str],
+    content: Content,
+    fs: float | None,
+    file_fs: float | None,
+    unit: str | None = None,
+    unit_per_full_scale: float | None = None,
+) -> Recording:
+    """Return the content of a file as the taps of paths; the arguments are those of `read_path`."""
     rate, wanted = rates_of(path, content, fs, file_fs)
     taps, unit = scaled(content, unit, unit_per_full_scale)
     if content.start_s:

@@ -166,7 +166,8 @@ def read_recording(
 
     The suffix of the file tells its format, or else how the file begins. Whole-number samples of audio files are scaled
     so that full scale is 1. In formats that hold arrays, the longer axis is time. A first column of text that rises evenly
-    is time (in seconds, or the unit of its heading; without one, the sample number if it rises by 1) and is left out. The page *File formats* has all of it.
+    is time (in seconds, or the unit of its heading; without one, the sample number if it rises by 1) and is left out. The
+    page *File formats* has all of it.
 
     Nothing is unpickled. Files that are compressed may become at most 64 MiB or 100 times their size, whichever is more.
 
@@ -225,21 +226,33 @@ def read_recording(
     >>> recording.samples.tolist()
     [[0.0, 1.0, -0.5], [2.0, 0.0, 0.0]]
     """
-    content, name = read_content(path, channel=channel, variable=variable), Path(path).name
+    content = read_content(path, channel=channel, variable=variable)
+    if calibrator is not None:
+        if unit_per_full_scale is not None or unit not in (None, "Pa"):
+            raise ValueError("calibrator gives scale and unit (Pa): leave out unit and unit_per_full_scale")
+        unit, unit_per_full_scale = "Pa", calibration_factor(calibrator, level_db, channel=channel)
+    return recording_of(path, content, fs, file_fs, unit, unit_per_full_scale)
+
+
+def recording_of(
+    path: str | os.PathLike[str],
+    content: Content,
+    fs: float | None,
+    file_fs: float | None,
+    unit: str | None = None,
+    unit_per_full_scale: float | None = None,
+) -> Recording:
+    """Return the content of a file as a recording; the arguments are those of `read_recording`."""
     if content.samples.ndim > 2:
         raise ValueError(
             f"{path} must hold signals, (n_channels, n_samples), got shape {content.samples.shape}; read impulse responses "
             "with paths.read_path"
         )
     rate, wanted = rates_of(path, content, fs, file_fs)
-    if calibrator is not None:
-        if unit_per_full_scale is not None or unit not in (None, "Pa"):
-            raise ValueError("calibrator gives scale and unit (Pa): leave out unit and unit_per_full_scale")
-        unit, unit_per_full_scale = "Pa", calibration_factor(calibrator, level_db, channel=channel)
     samples, unit = scaled(content, unit, unit_per_full_scale)
     if wanted != rate:
         samples = _resampled(path, samples, rate, wanted)
-    return Recording(samples, wanted, unit, name, content.fs)
+    return Recording(samples, wanted, unit, Path(path).name, content.fs)
 
 
 def calibration_factor(
