@@ -72,7 +72,9 @@ def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | Non
     from ..bench import algorithms
     from ..controllers.base import constraint_for
     from ..paths import PathTolerance
+    from ..signals.content import require_file
 
+    require_file(path)
     try:
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:

@@ -16,6 +16,7 @@ from xml.sax.saxutils import quoteattr
 from numpy.typing import DTypeLike
 
 from .._validate import as_positive
+from .._writing import replacing
 from ..core.building import build
 from .c99 import checked_name, exported_as
 from .source import FLAGS_OF_AN_EXPORT, Exported
@@ -99,7 +100,7 @@ def export_fmu(
             binary = Path(folder, f"{name}{suffix}")
             build([Path(folder, file) for file in sources if file.endswith(".c")], binary, target=target)
             files[f"binaries/{place}/{binary.name}"] = binary.read_bytes()
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+    with replacing(path) as whole, zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED) as archive:
         for file, content in sorted(files.items()):
             archive.writestr(zipfile.ZipInfo(file, OLDEST), content, zipfile.ZIP_DEFLATED)
     return path

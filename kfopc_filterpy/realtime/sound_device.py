@@ -10,6 +10,7 @@ import numpy as np
 
 from .._validate import as_count, as_positive
 from .interfaces import Block
+from .running import FaultError
 
 
 class SoundDevice:
@@ -131,7 +132,7 @@ class SoundDevice:
         try:
             heard, overflowed = self._heard.get(timeout=self.patience_s)
         except Empty:
-            raise RuntimeError(
+            raise FaultError(
                 f"no block came from the sound card for {self.patience_s:g} s: was it unplugged, or its server stopped?"
             ) from None
         signals = heard.T.astype(np.float64)
