@@ -185,6 +185,15 @@
     return y;
   }
 
+  function ticks(left, top, width, texts) {
+    figure.fillStyle = COLOURS.line;
+    texts.forEach((text, k) => {
+      figure.textAlign = k === 0 ? "left" : k === texts.length - 1 ? "right" : "center";
+      figure.fillText(text, left + (width * k) / (texts.length - 1), top + 16);
+    });
+    figure.textAlign = "left";
+  }
+
   function curve(points, colour, width = 1.5) {
     figure.strokeStyle = colour;
     figure.lineWidth = width;
@@ -204,10 +213,13 @@
       return values.subarray(0, Math.floor((2000 / (signals.fs / 2)) * values.length) || values.length);
     });
     const peak = Math.max(-100, ...spectra[0]);
-    const level = axes(left, 30, width, 150, "Spectrum at the microphone up to 2 kHz: noise (grey), error (orange)", -60, 0, 20, " dB");
+    const level = axes(left, 30, width, 150, "Spectrum at the microphone: noise (grey), error (orange)", -60, 0, 20, " dB");
+    const shown = Math.min(2000, signals.fs / 2);
+    ticks(left, 180, width, [0, 1, 2, 3, 4].map((k) => `${(shown * k) / 4} Hz`));
     spectra.forEach((values, k) =>
       curve(Array.from(values, (value, n) => [left + (width * n) / values.length, level(value - peak)]), k ? COLOURS.error : COLOURS.before));
     const ratio = axes(left, 240, width, 150, "Last 20 s: control power over the rating (blue), error over noise (orange)", -20, 40, 20, " dB");
+    ticks(left, 390, width, [0, 1, 2, 3, 4].map((k) => `${(SHOWN_S * k) / 4} s`));
     const x = (n) => left + (width * n * (history[0]?.samples ?? 1)) / (SHOWN_S * signals.fs);
     const db = (value) => 10 * Math.log10(Math.max(value, 1e-6));
     curve([[left, ratio(0)], [left + width, ratio(0)]], COLOURS.line);

@@ -17,7 +17,7 @@ from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_
 from kfopc_filterpy.plot.style import new_axes
 
 from .page import images, players, rendered
-from .report import prepare_folder, write_files, write_whole
+from .report import write_files, write_whole
 from .study_report import EXCERPT_S, HEADROOM, SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Sound, StudyReport, Table
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def require_page() -> None:
 def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Path:
     """Write the page, the figures, the sounds and verdict.json into a folder; return the path of the page."""
     require_page()
-    path, volts = prepare_folder(folder), verdict.volts_per_unit
+    path, volts = Path(folder), verdict.volts_per_unit
     study = StudyReport(
         "verdict",
         "Verdict",
@@ -94,6 +94,10 @@ def _figures(verdict: Assessment) -> Iterator[FigureItem]:
     if verdict.channels is not None:
         each += ", relative to its rating, of the loudspeaker that took most"
     caption = f"What a rated power buys: the least error of any fixed filter of this length, with {each}."
+    if np.all(np.isfinite(verdict.least_rated_power)):
+        caption += (
+            f" Least: the least rated power with which {verdict.algorithm}, which adapts, reaches what is wanted."
+        )
     yield FigureItem("bound", caption, _bound(verdict).figure)
     yield from error_figures(
         verdict.runs,
