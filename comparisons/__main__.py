@@ -6,6 +6,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -27,7 +28,8 @@ from .studies import (
 )
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
-SPEED, SWEEP, SOAK, BOARD = "speed", "sweep", "soak", "board"
+SPEED = "speed"
+ALONE = {"sweep": ".sweep.command", "soak": ".soak.study", "board": ".board.study"}  # with options of their own
 STUDIES: dict[str, Study] = {
     "tonal": (tonal.main, tonal.planned_runs),
     "broadband": (broadband.main, broadband.planned_runs),
@@ -51,18 +53,9 @@ FURTHER: dict[str, Study] = {  # beyond the paper
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the studies named, all by default; write report.html, results.json, figures and audio into a folder."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if arguments[:1] == [SWEEP]:
-        from .sweep import command as sweep_command
-
-        return sweep_command.main(arguments[1:])
-    if arguments[:1] == [SOAK]:
-        from .soak import study as soak_study
-
-        return soak_study.main(arguments[1:])
-    if arguments[:1] == [BOARD]:
-        from .board import study as board_study
-
-        return board_study.main(arguments[1:])
+    if arguments and arguments[0] in ALONE:
+        status: int = import_module(ALONE[arguments[0]], __package__).main(arguments[1:])
+        return status
     parser = argparse.ArgumentParser(
         prog="python -m comparisons", description="Reproduce the studies of the KF-OPC paper."
     )
@@ -78,8 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
-    known = (*STUDIES, *FURTHER, SPEED, SWEEP, SOAK, BOARD)
-    for name in (SWEEP, SOAK, BOARD):
+    known = (*STUDIES, *FURTHER, SPEED, *ALONE)
+    for name in ALONE:
         if name in options.studies:
             parser.error(f"{name} runs alone, and is named first: its options follow it")
     unknown = [name for name in options.studies if name not in known]

@@ -17,9 +17,8 @@ class FxNLMS(CoreController):
 
     One step size therefore suits soft and loud noise. In a quiet passage, the energy counts as at least a thousandth of
     the usual one; otherwise the weights would follow the noise of the microphones. The usual energy is that of the last
-    thousand filter lengths. With several channels, the steps of all filters are divided by
-    the same energy, that of all filtered references together. So their direction remains that of the multiple-error
-    LMS:
+    thousand filter lengths. With several channels, the steps of all filters are divided by the same energy, that of all
+    filtered references together. So their direction remains that of the multiple-error LMS:
 
     .. math:: w_{ji}(n+1) = w_{ji}(n) + \mu \frac{\sum_k e_k(n)\, x'_{kji}(n)}
        {\sum_{k,j,i} x'_{kji}(n)^T x'_{kji}(n)}

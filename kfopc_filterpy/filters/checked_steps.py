@@ -73,9 +73,8 @@ def run_or_undo(kf: KalmanFilter, step: Callable[..., None], arguments: tuple[An
     except BaseException as error:
         kf.__dict__.clear()
         kf.__dict__.update(before)
-        if not isinstance(
-            error, ValueError | TypeError | OverflowError | RuntimeWarning
-        ):  # numpy's warnings may be errors
+        # numpy's warnings may be errors
+        if not isinstance(error, ValueError | TypeError | OverflowError | RuntimeWarning):
             raise
         if checks is not None:
             checks(kf, *arguments)

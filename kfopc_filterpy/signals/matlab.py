@@ -20,12 +20,8 @@ _COMPRESSED, _MATRIX = 15, 14  # MATLAB's numbers for these elements
 _UINT32, _NUMBER_TYPES = 6, {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}  # of the numbers in an element
 _TEXT_TYPES = {16, 17, 18}
 _NUMBER_CLASSES, _COMPLEX = range(6, 16), 0x800  # of a variable: double to uint64, and the flag beside it
-_CELL, _CHAR, _SPARSE, _WITH_FIELDS = (
-    1,
-    4,
-    5,
-    {2: 3, 3: 4},
-)  # classes; of a struct and an object, where their names begin
+_CELL, _CHAR, _SPARSE = 1, 4, 5  # further classes
+_WITH_FIELDS = {2: 3, 3: 4}  # structs and objects, and the part in which the names of their fields begin
 _WITH_ELEMENTS = (_CELL, _CHAR, *_WITH_FIELDS)
 # Parts of a variable: flags, dimensions and name, and what its class adds. Complex numbers have one more.
 _PARTS = {**dict.fromkeys(_NUMBER_CLASSES, 4), _CELL: 3, _CHAR: 4, _SPARSE: 6, 2: 5, 3: 6}
