@@ -53,7 +53,10 @@ def read_audio(path: str | os.PathLike[str]) -> Content:
         if bits is not None:
             frames *= _justified(path, frames, bits, _BYTES.get(file.subtype, 0), file.channels)
     if len(frames) == 0:
-        raise ValueError(f"{path} holds no samples (zero frames): record or export it again")
+        raise ValueError(
+            f"{path} holds no samples: its header claims zero frames, in a file of {Path(path).stat().st_size} bytes; "
+            f"record or export it again. Was the recorder interrupted? What it wrote may be there still: {convert}"
+        )
     if len(frames) < claimed:
         raise ValueError(f"{path} is cut short: its header claims {claimed} frames, {len(frames)} could be read")
     return Content(frames.T, float(fs))

@@ -195,12 +195,14 @@ def _name_of(
         ]
         if len(names) == 1:
             return names[0]
-        if len(shapes) == 1:
+        if len(shapes) == 1 and not others:
             return next(iter(shapes))
         few = "several variables" if names else "no signal"
+        rest = "" if names else "".join(f", {name} ({kind})" for name, kind in sorted(others.items()))
         example = sorted(names or others or shapes)[0]
         raise ValueError(
-            f"{path} holds {few}: {there}; choose one with the option variable (in a command also {Path(path).name}:{example})"
+            f"{path} holds {few}: {there}{rest}; choose one with the option variable (in a command also "
+            f"{Path(path).name}:{example})"
         )
     if variable in others:
         raise ValueError(f"variable {variable!r} of {path} must hold real numbers, got {others[variable]}")

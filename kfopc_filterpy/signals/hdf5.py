@@ -73,7 +73,10 @@ def read_sofa_here(path: str | os.PathLike[str]) -> Content:
     with _h5py(path).File(path, "r") as file:
         kind = _text(file.attrs.get("DataType"))
         if _text(file.attrs.get("Conventions")) != "SOFA" or kind not in ("FIR", "FIR-E"):
-            raise ValueError(f"{path} must be a SOFA file with impulse responses (DataType FIR or FIR-E), got {kind!r}")
+            raise ValueError(
+                f"{path} must be a SOFA file with impulse responses (DataType FIR or FIR-E), got {kind!r}; export other "
+                "data as WAV, .mat or .npz"
+            )
         responses = _read(path, file, "Data.IR")
         rates = np.unique(_read(path, file, "Data.SamplingRate"))
         delays = _read(path, file, "Data.Delay") if "Data.Delay" in file else np.zeros(1)

@@ -16,10 +16,12 @@ _LONGEST_HEADER = 100  # lines
 _REW = "* Impulse Response data saved by REW"
 _LABVIEW, _END_OF_HEADER = "LabVIEW Measurement", "***End_of_Header***"
 _NO_SIGNAL = 100  # rows: no signal rises for so long
+_LEAST_RISES = 10  # of a column that is no signal, between values that repeat
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _SECONDS = {"s": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}  # by the first letter of the unit
 # The first column's name, if any, and its unit: "Time (ms)", "t/s", "(µs)"; "\ufffd" is µ in another encoding.
 _TIME_UNIT = re.compile(r"\W*?(?:\w+?[\s(\[/_]+)?(seconds?|sec|s|ms|msec|[uµμ\ufffd]s|usec|ns)(?!\w)")
+_FIRST_NAME = re.compile(r"[^,;\t]*[,;\t]|\S+\s+")  # of a heading
 _FREQUENCY = re.compile(r"\W*(freq|hz\b|f\s*[(\[/]\s*hz)", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d)")
 _ONE_COMMA = re.compile(r"([+-]?\d+),(\d+)(e[+-]?\d+)?", re.IGNORECASE)  # two columns of whole numbers, or one number
@@ -44,7 +46,7 @@ class _Layout(NamedTuple):
         """Return a line without quotes, decimal commas and a separator at its end."""
         line = _unquoted(line).rstrip()
         line = _DECIMAL_COMMA.sub(".", line) if self.has_decimal_comma else line
-        return line.removesuffix(self.delimiter) if self.delimiter else line
+        return line.rstrip(self.delimiter) if self.delimiter else line
 
 
 def read_text(path: str | os.PathLike[str]) -> Content:
@@ -66,9 +68,15 @@ def read_table(path: str | os.PathLike[str], *, n_least: int = 1) -> Table:
         names = header[-1].strip() if header else ""
         if _is_decimal(path, names, islice(_lines(path), layout.first, None)):
             layout = layout._replace(delimiter=None, has_decimal_comma=True)
-    columns = np.loadtxt(
-        map(layout.plain, islice(_lines(path), layout.first, None)), delimiter=layout.delimiter, ndmin=2
-    )
+    # A "#" begins a comment at the start of a line only: "1.#INF" is no 1.
+    rows = (layout.plain(line) for line in islice(_lines(path), layout.first, None) if not line.startswith("#"))
+    try:
+        columns = np.loadtxt(rows, delimiter=layout.delimiter, comments=None, ndmin=2)
+    except ValueError as error:
+        what = str(error).partition("; use `usecols`")[0]
+        raise ValueError(
+            f"{path} is damaged or cut short, or has an empty field: from line {layout.first + 1} on, {what}"
+        ) from error
     n_names = len(header[-1].split(",")) if header and layout.delimiter == "," else 0
     if n_names > 1 and 2 * n_names == columns.shape[1] and not np.any(columns % 1):  # "t,p" above "0,125,0,5"
         raise _ambiguous(path)
@@ -91,6 +99,8 @@ def _unquoted(line: str) -> str:
 
 
 def _layout(path: str | os.PathLike[str], head: list[str]) -> _Layout:
+    if any("\0" in line for line in head):
+        raise ValueError(f"{path} is neither text nor of a kind that is read: export it as WAV, text, .mat or .npy")
     for first, line in enumerate(head):
         for delimiter in (";", "\t", ",", None):
             layout = _Layout(first, delimiter, delimiter != ",")
@@ -150,21 +160,32 @@ def _without_time(path: str | os.PathLike[str], table: Table) -> Content:
             "impulse response (or the recording) instead"
         )
     times, steps = columns[:, 0], np.diff(columns[:, 0])
+    without_first = Table([_FIRST_NAME.sub("", line, count=1) for line in header], columns[:, 1:])
     if header and header[-1].startswith((",", ";", "\t")) and np.all(steps == 1):  # an index, which has no name
-        return Content(columns[:, 1:])
-    if len(times) < 3 or not np.all(steps > 0):
+        return _without_time(path, without_first)
+    repeats = np.any(steps == 0) and np.sum(steps) >= _LEAST_RISES * np.max(steps)  # times with few digits
+    if len(times) < 3 or not (np.all(steps > 0) or (np.all(steps >= 0) and repeats)):
         return Content(columns)
     step = even_step(times)
     if step is None:
         if len(times) >= _NO_SIGNAL:
             raise ValueError(
                 f"{path} has a first column that rises in uneven steps, from {steps.min():g} to {steps.max():g}: export it "
-                "with a constant sampling rate, or without the times"
+                "with a constant sampling rate and all digits of the times, or without the times"
             )
         return Content(columns)
     units = [found[1] for found in map(_TIME_UNIT.match, reversed(header)) if found]
     if step == 1 and not units:  # the number of each sample
-        return Content(columns[:, 1:])
+        named = dict(zip(*(line.strip().split(",") for line in header[-2:]), strict=False)) if len(header) > 1 else {}
+        if {"Start", "Increment"} <= named.keys():  # an oscilloscope of Rigol
+            step_s, start_s = float(named["Increment"]), float(named["Start"])
+            return Content(columns[:, 1:], rate_of_step(step_s, path), start_s=start_s)
+        return _without_time(path, without_first)
+    if step > 1 and not units:
+        raise ValueError(
+            f"{path} has a first column that rises in steps of {step:g} without a unit: are they times? Name their unit "
+            'in the line above the numbers, as in "Time (ms)", or leave out the column'
+        )
     unit_s = _SECONDS.get(units[0][0], 1e-6) if units else 1.0
     return Content(columns[:, 1:], rate_of_step(step * unit_s, path), start_s=float(times[0] * unit_s))
 

@@ -14,6 +14,7 @@ from .content import Content, optional_module, rate_of_step
 
 _IN_TIME = {0: "general", 1: "time response", 25: "FIR filter"}  # function types whose samples may be in time
 _PADDED = re.compile(rb"^((?: *[-+]?\d\.\d+[eE][-+]\d+)+) +(?=\r?$)", re.MULTILINE)  # a row of numbers, then blanks
+_LONGEST_ROW = 6  # numbers
 _BINARY = re.compile(rb"^    58b", re.MULTILINE)
 
 
@@ -44,6 +45,9 @@ def _from_pyuff(path: str | os.PathLike[str], file: Any) -> Content:
         )
     sets = [file.read_sets(index) for index in in_time]
     for one in sets:
+        surplus = one["data"][one["num_pts"] :]
+        if surplus.size < _LONGEST_ROW and not np.any(surplus):  # some writers fill the last row with zeros
+            one["data"] = one["data"][: one["num_pts"]]
         _require_even(path, one)
     grids = {(one["data"].size, one["abscissa_inc"], one["abscissa_min"]) for one in sets}
     if len(grids) != 1:

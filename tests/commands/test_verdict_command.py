@@ -142,7 +142,7 @@ def test_a_curve_is_a_local_file_that_is_not_unpacked(option, command, tmp_path)
     other = [] if option == "--displacement" else ["--displacement", "falling.csv"]
     for path, message in (
         ("http://127.0.0.1:9/x.csv", "http://127.0.0.1:9/x.csv does not exist or is not a file"),
-        (tmp_path / "x.csv.gz", "is text that is no numbers"),
+        (tmp_path / "x.csv.gz", "is neither text nor of a kind that is read"),
     ):
         code, _, err = command("verdict", *SCENE, *rating, option, path, *other)
         assert code == 2

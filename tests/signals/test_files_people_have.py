@@ -76,6 +76,48 @@ def test_an_empty_field_is_named(tmp_path):
         read_recording(tmp_path / "x.csv", fs=8)
 
 
+@pytest.mark.parametrize(
+    ("header", "row", "n_before"),
+    [
+        ("X,CH1,Start,Increment,\nSequence,Volt,4.0e-05,2.0e-05,\n", "{n},{value},,\n", 2),
+        (";Scopy version,48ab2e8\n;Sample rate,50000\nSample,Time(S),CH1(V)\n", "{n},{time:.6f},{value}\n", 0),
+        (",time (ms),p\n", "{n},{ms:.3f},{value}\n", 0),  # a table of pandas
+        ("Sample Time(ms) p\n", "{n} {ms:.3f} {value}\n", 0),
+    ],
+)
+def test_a_number_of_each_sample_hides_neither_times_nor_rate(tmp_path, header, row, n_before):
+    rows = [row.format(n=n, time=n / 50000, ms=n / 50, value=value) for n, value in enumerate(signal())]
+    (tmp_path / "x.csv").write_text(header + "".join(rows))
+    recording = read_recording(tmp_path / "x.csv")
+    assert recording.fs == 50000
+    np.testing.assert_array_equal(recording.samples, signal())
+    np.testing.assert_array_equal(read_path(tmp_path / "x.csv").samples, [0.0] * n_before + signal().tolist())
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("{time:.4f},0.5\n", r"rises in uneven steps, from 0 to 0\.0001: export .* all digits of the times"),
+        ("{pair:.6f},0.5\n", r"rises in uneven steps, from 0 to 4e-05"),  # the least and the largest value of each step
+        ("{us},0.5\n", r"rises in steps of 20 without a unit: .* \"Time \(ms\)\""),
+        ("{time:.6f},1.#INF\n", r"is text that is no numbers"),
+        ("{time:.6f},{clipped}\n", r"is damaged or cut short, .*could not convert string '1\.#INF' .* at row 200"),
+        ("{time:.6f},{gap}\n", r"is damaged or cut short, or has an empty field: .* from 2 to 1 at row 201$"),
+        ("{time:.6f}\0,0.5\n", r"is neither text nor of a kind that is read"),
+    ],
+)
+def test_columns_that_leave_rate_or_samples_open_are_refused(tmp_path, row, message):
+    rows = [
+        row.format(
+            time=n / 50000, pair=n // 2 / 25000, us=20 * n, clipped="1.#INF" if n == 200 else "1", gap="1"[: n != 200]
+        )
+        for n in range(300)
+    ]
+    (tmp_path / "x.csv").write_text("t,p\n" + "".join(rows))
+    with pytest.raises(ValueError, match=rf"x\.csv .*{message}"):
+        read_recording(tmp_path / "x.csv", fs=50000)
+
+
 def labview(x_columns="One", decimal=".", comment="", segments=1, delta="1.000000E-4\t1.000000E-4"):
     """Return two channels as LabVIEW writes them, "Write To Measurement File" with one header."""
     text = (
@@ -172,6 +214,12 @@ def test_a_wav_from_a_pipe_is_read_to_its_end(tmp_path, claimed):
     np.testing.assert_array_equal(read_recording(tmp_path / "x.wav").samples, signal())
 
 
+def test_a_recorder_that_was_interrupted_is_named_with_the_remedy(tmp_path):
+    (tmp_path / "x.wav").write_bytes(wav(low_bits(16, 2), 16, 2, claimed=0))
+    with pytest.raises(ValueError, match=r"x\.wav holds no samples: .* in a file of 32044 bytes; .* ffmpeg -i x\.wav "):
+        read_recording(tmp_path / "x.wav")
+
+
 @pytest.mark.parametrize("suffix", ["mp3", "ogg", "opus", "w64", "caf", "au", "m4a", "bin"])
 def test_other_sound_files_are_refused_with_the_remedy(tmp_path, suffix):
     path = tmp_path / f"x.{suffix}"
@@ -244,6 +292,12 @@ def test_rates_that_contradict_are_refused(tmp_path, beside, message):
         read_recording(tmp_path / "x.mat", fs=FS)
 
 
+def test_the_rate_beside_what_cannot_be_read_is_no_signal(tmp_path):
+    scipy.io.savemat(tmp_path / "x.mat", {"ir": np.array([SIGNAL, "text"], dtype=object), "fs": float(FS)})
+    with pytest.raises(ValueError, match=r"x\.mat holds no signal: fs \(1, 1\), ir \(cell\); choose .* x\.mat:ir\)"):
+        read_recording(tmp_path / "x.mat")
+
+
 def hdf5_struct(path, content):
     """Write a struct as MATLAB's `save -v7.3` does: a group, its fields with swapped axes."""
     h5py = pytest.importorskip("h5py")
@@ -296,3 +350,16 @@ def test_a_uff_whose_last_row_is_padded_with_blanks_is_read(tmp_path, n_samples,
     lines = path.read_bytes().splitlines()
     path.write_bytes(end.join(line.ljust(80) if line.strip() != b"-1" else line for line in lines) + end)
     np.testing.assert_allclose(read_recording(path).samples, signal(2)[:, :n_samples], rtol=0, atol=1e-11)  # 13 digits
+
+
+@pytest.mark.parametrize(("fill", "is_read"), [("0.00000000000e+00", True), ("1.00000000000e+00", False)])
+def test_a_uff_whose_last_row_is_filled_with_zeros_is_read(tmp_path, fill, is_read):
+    path = tmp_path / "x.uff"
+    write_uff(path, signal()[:62])
+    before, end, after = path.read_text().rpartition("\n    -1")
+    path.write_text(before + 2 * f"{fill:>20}" + end + after)
+    if is_read:
+        np.testing.assert_allclose(read_recording(path).samples, signal()[:62], rtol=0, atol=1e-11)  # 13 digits
+        return
+    with pytest.raises(ValueError, match=r"x\.uff is damaged .* claims 62 samples, 64 could be read"):
+        read_recording(path)

@@ -415,8 +415,8 @@ def test_a_file_without_samples_is_refused(tmp_path):
     put(tmp_path / "new.mat", 0, b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     (tmp_path / "x.csv").write_text("left,right\n")
     for name, message in (
-        ("x.wav", r"holds no samples \(zero frames\)"),
-        ("x.aiff", r"holds no samples \(zero frames\)"),
+        ("x.wav", r"holds no samples: its header claims zero frames"),
+        ("x.aiff", r"holds no samples: its header claims zero frames"),
         ("x.flac", r"is empty \(0 bytes\)"),  # libsndfile writes nothing
         ("x.npy", r"holds no samples, shape \(2, 0\)"),
         ("x.npz", r"variable 'noise' of .*x\.npz is empty"),
@@ -448,14 +448,16 @@ def test_nan_is_refused_with_its_place_and_only_in_the_channel_that_is_read(tmp_
 )
 def test_text_that_is_no_numbers_is_refused(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=rf"{name} (is text that is no numbers|cannot be read as text)"):
+    with pytest.raises(ValueError, match=rf"{name} (is text that is no numbers|is neither text nor)"):
         read_recording(tmp_path / name, fs=FS)
 
 
 @pytest.mark.parametrize("text", ["0.5,1\n0.25,2\n0.125", "1\n2\nstopped by user\n"])
 def test_a_row_of_another_length_is_refused(tmp_path, text):
     (tmp_path / "x.csv").write_text(text)
-    with pytest.raises(ValueError, match=r"x\.csv cannot be read as text: the number of columns changed"):
+    with pytest.raises(
+        ValueError, match=r"x\.csv is damaged or cut short, .*, the number of columns changed from \d to \d at row \d+$"
+    ):
         read_recording(tmp_path / "x.csv", fs=FS)
 
 
