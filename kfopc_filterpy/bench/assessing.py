@@ -34,6 +34,7 @@ from kfopc_filterpy.metrics import (
 from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.file_checks import require_heard, require_sound
+from kfopc_filterpy.paths.models import sampling_rate, tells_rate
 from kfopc_filterpy.paths.path_matrix import primary_paths, secondary_paths
 from kfopc_filterpy.paths.uncertainty import Uncertainty
 from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_remarks
@@ -83,7 +84,7 @@ def assess(
     Parameters
     ----------
     noise : array_like, shape (n_samples,) or (I, n_samples)
-        Recording of the reference microphones, with silent loudspeakers.
+        Recording of the reference microphones, with silent loudspeakers. The rate of a `Recording` must be `fs`.
     primary : array_like, shape (n_path,) or (K, I, n_path), or control.TransferFunction, optional
         Impulse response from each reference to each error microphone. None if there is a `disturbance`.
     secondary : array_like, shape (n_path,) or (K, J, n_path), or control.TransferFunction
@@ -294,12 +295,12 @@ def recorded_signals(
 
     One channel of everything comes without channel axes.
     """
-    x = _recording(noise, "noise")
+    x = _recording(noise, "noise", fs)
     s, _ = secondary_paths(secondary, fs=fs, name="secondary")
     K, J, _ = s.shape
     require_sound("secondary", s)
     if disturbance is not None:
-        d = _recording(disturbance, "disturbance", length=x.shape[1])
+        d = _recording(disturbance, "disturbance", fs, length=x.shape[1])
         if len(d) != K:
             raise ValueError(
                 f"disturbance must have a channel for each of the {K} microphones of secondary, got {len(d)}"
@@ -319,8 +320,10 @@ def recorded_signals(
     return (x[0], d[0], s[0, 0]) if (K, J, len(x)) == (1, 1, 1) else (x, d, s)
 
 
-def _recording(value: Any, name: str, length: int | None = None) -> np.ndarray:
+def _recording(value: Any, name: str, fs: float, length: int | None = None) -> np.ndarray:
     """Return the channels of a recording without their offsets, (channels, n_samples)."""
+    if tells_rate(value):
+        sampling_rate(value, fs, name=name)
     channels = np.atleast_2d(as_channels(value, name))
     for number, channel in enumerate(channels):
         which = name if len(channels) == 1 else f"{name}[{number}]"

@@ -143,12 +143,12 @@ class Files:
     def _chosen(self, path: str, source: str, is_path: bool, fs: float | None) -> Recording:
         """Return the channels of a file that its argument or the options choose, at a rate."""
         from ..paths.reading import path_of
-        from ..signals.recordings import read_content, recording_of
+        from ..signals.recordings import LEAST_SURE_RATE, read_content, recording_of
 
         content, file_fs = read_content(source, variable=_named(path).variable or self.options.variable), None
-        if content.fs is None:
+        if content.fs is None or content.fs < LEAST_SURE_RATE:
             file_fs, self._without_rate = self.options.file_fs, True
-            if file_fs is None:
+            if file_fs is None and content.fs is None:
                 raise ValueError(
                     f"{path} states no sampling rate: give the rate in Hz at which it was sampled, for example with "
                     "--file-fs 48000 (--fs is the rate to which files are resampled)"

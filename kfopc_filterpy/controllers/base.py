@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
+from functools import wraps
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 from .._types import NumberOrArray, PerLoudspeaker
 from .._validate import as_positive
 from ..checkpoint import Checkpointed
+from ..core.block import InUse
 from ..core.run_loop import Steps
 from ..power.constraint import DEFAULT_FS, Constraints, OutputPowerConstraint
 from .processing import BlockProcessing
@@ -105,6 +107,17 @@ def passed_on(name: str, doc: str) -> Any:
     return property(read, assign, doc=doc)
 
 
+def _alone(step: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a method of a wrapper that a second thread cannot enter."""
+
+    @wraps(step)
+    def guarded(wrapper: Any, *arguments: Any) -> Any:
+        with wrapper.in_use:
+            return step(wrapper, *arguments)
+
+    return guarded
+
+
 class WrappedController(BlockProcessing, Checkpointed):
     """Base class of a controller that wraps another one and passes on its attributes."""
 
@@ -115,9 +128,24 @@ class WrappedController(BlockProcessing, Checkpointed):
     rated_power = passed_on("rated_power", "Rated power of the inner controller; can be assigned if that has one.")
     limiter = passed_on("limiter", "Limiter of the inner controller; can be assigned if the inner controller's can.")
 
+    def __init_subclass__(cls) -> None:
+        """Refuse a second thread in the steps of every wrapper."""
+        for name in {"control_signal", "update", "listen"} & vars(cls).keys():
+            setattr(cls, name, _alone(vars(cls)[name]))
+
     def __init__(self, controller: Controller, what: str) -> None:
         self.controller = checked_controller(controller)
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} {what}"
+
+    @property
+    def in_use(self) -> InUse:
+        """Context that refuses a second thread: the inner controller's, or the wrapper's own."""
+        inner = getattr(self.controller, "in_use", None)
+        return inner if isinstance(inner, InUse) else self.__dict__.setdefault("_in_use", InUse())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the context, which belongs to the threads of this process."""
+        return {name: value for name, value in vars(self).items() if name != "_in_use"}
 
     def __getattr__(self, name: str) -> Any:
         """Return any other attribute of the inner controller, except special methods such as those for copies."""
@@ -125,6 +153,7 @@ class WrappedController(BlockProcessing, Checkpointed):
             raise AttributeError(name)
         return getattr(self.controller, name)
 
+    @_alone
     def update(self, error: NumberOrArray) -> None:
         """Pass the error e(n) to the controller's `update`."""
         self.controller.update(error)

@@ -94,13 +94,13 @@ def path_of(
     unit_per_full_scale: float | None = None,
 ) -> Recording:
     """Return the content of a file as the taps of paths; the arguments are those of `read_path`."""
-    rate, wanted = rates_of(path, content, fs, file_fs)
+    rate, wanted, stated = rates_of(path, content, fs, file_fs)
     taps, unit = scaled(content, unit, unit_per_full_scale)
     if content.start_s:
         taps = _from_time_zero(path, taps, content.start_s * rate)
     if wanted != rate:
         taps = _resampled(path, taps, rate, wanted)
-    return Recording(taps, wanted, unit, Path(path).name, content.fs)
+    return Recording(taps, wanted, unit, Path(path).name, stated)
 
 
 def _from_time_zero(path: str | os.PathLike[str], taps: np.ndarray, start: float) -> np.ndarray:

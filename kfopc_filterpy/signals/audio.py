@@ -18,7 +18,8 @@ _FORMATS = ("WAV", "WAVEX", "RF64", "AIFF", "FLAC")
 _LOSSLESS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE")  # codings of samples
 _BYTES = {"PCM_16": 2, "PCM_24": 3, "PCM_32": 4}
 _MOST_CHUNKS = 10_000
-_PCM = 1  # the tag of integers without loss
+_PCM, _EXTENSIBLE = 1, 0xFFFE  # the tags of integers without loss, and of a longer header that has the tag
+_TAGS = (b"TAG", b"ID3")  # of music, which some programs append without a chunk
 _CONTAINERS = {b"RIFF": "<", b"RF64": "<", b"BW64": "<", b"RIFX": ">", b"FORM": ">"}  # and their byte order
 
 
@@ -55,7 +56,7 @@ def read_audio(path: str | os.PathLike[str]) -> Content:
     if len(frames) == 0:
         raise ValueError(
             f"{path} holds no samples: its header claims zero frames, in a file of {Path(path).stat().st_size} bytes; "
-            f"record or export it again. Was the recorder interrupted? What it wrote may be there still: {convert}"
+            "record or export it again"
         )
     if len(frames) < claimed:
         raise ValueError(f"{path} is cut short: its header claims {claimed} frames, {len(frames)} could be read")
@@ -74,15 +75,23 @@ def _require_whole(path: str | os.PathLike[str]) -> _Bits | None:
         if kind not in _CONTAINERS or held < 12:
             return None
         order = _CONTAINERS[kind]
-        claimed = _claimed_end(file, order, kind in (b"RF64", b"BW64"))
+        samples_end, claimed = _claimed_ends(file, order, kind in (b"RF64", b"BW64"))
+        more = samples_end and _unclaimed(file, order, samples_end)
         spared = None if kind == b"FORM" else _spared(file, order)
     if claimed > held:
         raise ValueError(f"{path} is cut short: its header claims {claimed} bytes, {held} are there")
+    if more:
+        name, other = Path(path).name, f"{Path(path).stem}-pcm.wav"
+        raise ValueError(
+            f"{path} goes on for {more} bytes after the end of its samples that its header states: was the recorder "
+            f"interrupted? Read them with ffmpeg -ignore_length 1 -i {name} {other}, or leave them out with ffmpeg -i "
+            f"{name} {other}"
+        )
     return spared
 
 
-def _claimed_end(file: BinaryIO, order: str, is_64_bit: bool) -> int:
-    """Return where the file must end at the earliest by its header's sizes."""
+def _claimed_ends(file: BinaryIO, order: str, is_64_bit: bool) -> tuple[int, int]:
+    """Return where the samples end by the header's sizes, 0 if these do not say so, and where the file ends at the earliest."""
     (size,) = struct.unpack(f"{order}I", file.read(4))
     end = 8 + size if size not in _SIZES_UNKNOWN else 0
     wide_data = None
@@ -92,17 +101,35 @@ def _claimed_end(file: BinaryIO, order: str, is_64_bit: bool) -> int:
             wide, wide_data = struct.unpack("<QQ", file.read(16).ljust(16, b"\0"))
             end = max(end, 8 + wide)
         if name in (b"data", b"SSND"):
-            if size in _SIZES_UNKNOWN:  # the size of the whole is then none either
-                return 0 if wide_data is None else max(end, start + wide_data)
-            return max(end, start + size)
-    return end
+            if size in _SIZES_UNKNOWN:
+                if wide_data is None:  # the size of the whole is then none either
+                    return 0, 0
+                size = wide_data
+            return start + size, max(end, start + size)
+    return 0, end
+
+
+def _unclaimed(file: BinaryIO, order: str, end: int) -> int:
+    """Return how many bytes follow the samples that are no chunk: a recorder updates the sizes only from time to time."""
+    file.seek(end)
+    rest = file.read()
+    if len(rest) < 8 or not rest.strip(b"\0") or rest.startswith(_TAGS):
+        return 0
+    for begin in (0, 1):  # a chunk begins at an even byte; not every program knows
+        name, size = struct.unpack_from(f"{order}4sI", rest.ljust(9, b"\0"), begin)
+        if name.isascii() and name.decode().isprintable() and begin + 8 + size <= len(rest) + 1:
+            return 0
+    return len(rest)
 
 
 def _spared(file: BinaryIO, order: str) -> _Bits | None:
     for name, start, size in _chunks(file, order):
         if name == b"fmt " and size >= 16:
             file.seek(start)
-            tag, channels, _, _, block, bits = struct.unpack(f"{order}HHIIHH", file.read(16).ljust(16, b"\0"))
+            head = file.read(min(size, 28)).ljust(28, b"\0")
+            tag, channels, _, _, block, bits, _, valid, _, own_tag = struct.unpack(f"{order}HHIIHHHHII", head)
+            if tag == _EXTENSIBLE:
+                tag, bits = own_tag, min(bits, valid or bits)
             return _Bits(bits, block) if tag == _PCM and bits > 8 and 8 * block != bits * channels else None
     return None
 

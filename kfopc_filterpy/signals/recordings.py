@@ -34,6 +34,7 @@ _REFERENCE_PRESSURE = 20e-6  # Pa, of sound pressure levels
 _LEAST_TONE_S = 0.5  # of a calibrator
 _LEAST_TONE_SHARE = 0.9  # of the power of a calibrator's recording
 _LARGEST_DRIFT_DB = 0.5
+LEAST_SURE_RATE = 300.0  # Hz; kHz that stand for Hz, or ms for s, give less: recorders sample at up to 262 kHz
 
 # What a reader is called in messages, and the reader: of a path and a variable, or of a path only.
 _NAMED = {"a MAT file": read_mat, "a .npz file": read_npz}
@@ -193,7 +194,7 @@ def read_recording(
     level_db : float, default 94.0
         Sound pressure level of the calibrator in dB re 20 uPa.
     file_fs : float, optional
-        Sampling frequency in Hz of a file that states none.
+        Sampling frequency in Hz of a file that states none, or one below 300 Hz, which may be in kHz.
 
     Returns
     -------
@@ -209,7 +210,7 @@ def read_recording(
     ValueError, TypeError
         If the file is empty, cut short, damaged, claims more than it has, or holds NaN or Inf; if it holds several variables
         and none is chosen, or no such variable or channel; if no sampling rate is known, or `file_fs` is another than
-        the file's; if the rates are in no ratio of whole numbers; if a scale comes without its unit.
+        the file's; if the file states a rate below 300 Hz and neither `fs` nor `file_fs` confirms it; if the rates are in no ratio of whole numbers; if a scale comes without its unit.
 
     See Also
     --------
@@ -248,11 +249,11 @@ def recording_of(
             f"{path} must hold signals, (n_channels, n_samples), got shape {content.samples.shape}; read impulse responses "
             "with paths.read_path"
         )
-    rate, wanted = rates_of(path, content, fs, file_fs)
+    rate, wanted, stated = rates_of(path, content, fs, file_fs)
     samples, unit = scaled(content, unit, unit_per_full_scale)
     if wanted != rate:
         samples = _resampled(path, samples, rate, wanted)
-    return Recording(samples, wanted, unit, Path(path).name, content.fs)
+    return Recording(samples, wanted, unit, Path(path).name, stated)
 
 
 def calibration_factor(
@@ -379,21 +380,27 @@ def _kind_of(path: str | os.PathLike[str]) -> str:
 
 def rates_of(
     path: str | os.PathLike[str], content: Content, fs: float | None, file_fs: float | None
-) -> tuple[float, float]:
-    """Return the rate of a file, and the rate wanted, in Hz."""
+) -> tuple[float, float, float | None]:
+    """Return the rate of a file, the rate wanted, and the rate that the file states, in Hz."""
     wanted = None if fs is None else as_rate(fs, "fs")
     given = None if file_fs is None else as_rate(file_fs, "file_fs")
-    if content.fs is not None and given is not None and given != content.fs:
-        raise ValueError(
-            f"{path} states a sampling rate of {content.fs:g} Hz, but file_fs = {given:g} Hz: leave it out"
-        )
-    rate = content.fs or given or wanted
+    stated = content.fs
+    if stated is not None and stated < LEAST_SURE_RATE and stated != wanted:
+        if given is None:
+            raise ValueError(
+                f"{path} states a sampling rate of {stated:g} Hz: is it in kHz, or its times in ms? Pass the rate in Hz, "
+                f"file_fs={1000 * stated:g} or {stated:g} (in a command --file-fs)"
+            )
+        stated = None
+    if stated is not None and given is not None and given != stated:
+        raise ValueError(f"{path} states a sampling rate of {stated:g} Hz, but file_fs = {given:g} Hz: leave it out")
+    rate = stated or given or wanted
     if rate is None:
         raise ValueError(
             f"{path} states no sampling rate: pass fs, the rate in Hz at which it was sampled (or file_fs, if it is to be "
             "resampled to fs)"
         )
-    return rate, wanted or rate
+    return rate, wanted or rate, stated
 
 
 def scaled(content: Content, unit: str | None, unit_per_full_scale: float | None) -> tuple[np.ndarray, str]:

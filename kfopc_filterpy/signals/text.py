@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
-from itertools import islice
+from itertools import chain, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +13,10 @@ import numpy as np
 from .content import Content, even_step, rate_of_step
 
 _LONGEST_HEADER = 100  # lines
+_TEKTRONIX = re.compile(
+    r'"?Record Length"?(,[^,]*){4}'
+)  # its header has three columns, beside those of times and samples
+_CLOCK = re.compile(r"\d:\d\d:\d\d")
 _REW = "* Impulse Response data saved by REW"
 _LABVIEW, _END_OF_HEADER = "LabVIEW Measurement", "***End_of_Header***"
 _NO_SIGNAL = 100  # rows: no signal rises for so long
@@ -90,7 +94,10 @@ def _lines(path: str | os.PathLike[str]) -> Iterator[str]:
         encoding = "utf-16" if file.read(2) in _UTF16 else "utf-8-sig"
     # Names and units may be in any encoding. Damage within a number leaves no number.
     with open(path, encoding=encoding, errors="replace") as text:
-        yield from text
+        first = text.readline()
+        is_beside = _TEKTRONIX.match(first)
+        for line in chain((first,), text):
+            yield line.split(",", 3)[-1] if is_beside else line
 
 
 def _unquoted(line: str) -> str:
@@ -112,6 +119,11 @@ def _layout(path: str | os.PathLike[str], head: list[str]) -> _Layout:
         f"{path} is text that is no numbers: none in its first {len(head)} lines, which begin with {shown!r}; expected "
         "a column for each channel, at most 100 lines of header"
         + (f"; line {gaps[0]} has an empty field: fill it, or leave out its column" if gaps else "")
+        + (
+            "; times of day (hh:mm:ss) are not read: export seconds, or leave them out"
+            if _CLOCK.search(head[-1])
+            else ""
+        )
     )
 
 

@@ -19,7 +19,7 @@ from kfopc_filterpy.bench import algorithms, assess, compare_recordings
 from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA, advice_on
 from kfopc_filterpy.metrics import convergence_time_s, overshoot
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
-from kfopc_filterpy.signals import band_limited_noise
+from kfopc_filterpy.signals import Recording, band_limited_noise
 
 FS, SECONDS, TAPS = 8000, 3.0, 32
 PLENTY = 100.0  # times what full control takes
@@ -365,6 +365,8 @@ def test_the_levels_are_those_of_the_sounds(written):
             {"noise": noise()[:16000].reshape(2, 8000)},
             "primary must be (K microphones, I references, taps) = (1, 2, taps)",
         ),
+        ({"noise": Recording(noise(), 2 * FS)}, f"noise is sampled at {2 * FS} Hz but fs is {FS} Hz"),
+        ({"disturbance": Recording(noise(), 2 * FS)}, f"disturbance is sampled at {2 * FS} Hz but fs is {FS} Hz"),
         ({"rating": 0.0}, "rating must be greater than 0"),
         ({"algorithm": "KF"}, "algorithm must be one of 'KF-PB', 'KF-OPC', 'FxLMS'"),
         ({"want_db": -1.0}, "want_db must not be negative"),

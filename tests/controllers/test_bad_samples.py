@@ -15,7 +15,8 @@ from helpers.controllers import ALL
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy import KFOPC, FxLMS, FxNLMS, OutputLimiter, fx_rls, simulate
+from kfopc_filterpy import KFOPC, FxLMS, FxNLMS, LimitedController, OutputLimiter, fx_rls, simulate
+from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.signals import band_limited_noise, tone
 
 LOUD = [-1e160, 1e308]
@@ -170,3 +171,39 @@ def test_a_second_thread_is_refused_and_the_first_one_is_unharmed() -> None:
     running.join()
     np.testing.assert_array_equal(answers[0], expected)
     assert contents(controller) == contents(alone)
+
+
+class Patient:
+    """A user's own controller, which stays in a step until it is told to go on."""
+
+    def __init__(self) -> None:
+        self.started, self.may_go_on = threading.Event(), threading.Event()
+
+    def control_signal(self, reference: float) -> float:
+        self.started.set()
+        self.may_go_on.wait(10)
+        return float(reference)
+
+    def update(self, error: float) -> None: ...
+
+
+@pytest.mark.parametrize(
+    "wrap", [lambda own: LimitedController(own, OutputLimiter(4.0)), lambda own: FeedbackNeutralizer(own, [0.0, 0.1])]
+)
+def test_a_second_thread_is_refused_by_a_wrapper_of_ones_own_controller(wrap: Any) -> None:
+    own, answers = Patient(), []
+    controller = wrap(own)
+    running = threading.Thread(target=lambda: answers.append(controller.control_signal(1.0)))
+    running.start()
+    own.started.wait(10)
+    for call in (
+        lambda: controller.control_signal(2.0),
+        lambda: controller.update(1.0),
+        lambda: controller.process([2.0], [1.0]),
+        lambda: simulate(controller, [2.0], disturbance=[1.0], secondary_path=S),
+    ):
+        with pytest.raises(RuntimeError, match="in use by another thread"):
+            call()
+    own.may_go_on.set()
+    running.join()
+    assert answers == [1.0]

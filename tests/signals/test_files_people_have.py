@@ -16,6 +16,16 @@ from kfopc_filterpy.signals import read_recording
 # ---- text
 
 
+def test_the_columns_of_an_older_tektronix_stand_beside_its_header(tmp_path):
+    facts = ["Record Length,300,Points", "Sample Interval,2e-5,s", '"Trigger Time","0 12:00:00",']
+    rows = [f"{(n - 100) * 2e-5:.12f},   {value:.5f}" for n, value in enumerate(signal())]
+    text = "".join(f"{facts[n] if n < 3 else ',,'},{row},\n" for n, row in enumerate(rows))
+    (tmp_path / "x.csv").write_text(text)
+    recording = read_recording(tmp_path / "x.csv")
+    assert recording.fs == 50000
+    np.testing.assert_array_equal(recording.samples, np.round(signal(), 5))
+
+
 SCOPE = "Time,Channel A\n({unit}),(V)\n\n{rows}"
 
 
@@ -104,12 +114,19 @@ def test_a_number_of_each_sample_hides_neither_times_nor_rate(tmp_path, header, 
         ("{time:.6f},{clipped}\n", r"is damaged or cut short, .*could not convert string '1\.#INF' .* at row 200"),
         ("{time:.6f},{gap}\n", r"is damaged or cut short, or has an empty field: .* from 2 to 1 at row 201$"),
         ("{time:.6f}\0,0.5\n", r"is neither text nor of a kind that is read"),
+        ("12:00:{time:09.6f},0.5\n", r"is text that is no numbers: .*; times of day \(hh:mm:ss\) are not read"),
+        ("{ms:.6f},0.5\n", r"states a sampling rate of 50 Hz: is it in kHz, .* file_fs=50000 or 50 "),
     ],
 )
 def test_columns_that_leave_rate_or_samples_open_are_refused(tmp_path, row, message):
     rows = [
         row.format(
-            time=n / 50000, pair=n // 2 / 25000, us=20 * n, clipped="1.#INF" if n == 200 else "1", gap="1"[: n != 200]
+            time=n / 50000,
+            ms=n / 50,
+            pair=n // 2 / 25000,
+            us=20 * n,
+            clipped="1.#INF" if n == 200 else "1",
+            gap="1"[: n != 200],
         )
         for n in range(300)
     ]
@@ -173,13 +190,18 @@ def test_a_frequency_response_is_refused(tmp_path, read, header):
 # ---- sound
 
 
-def wav(samples, bits: int, block: int, *, claimed: int | None = None) -> bytes:
+def wav(samples, bits: int, block: int, *, claimed: int | None = None, is_extensible: bool = False) -> bytes:
     """Return a WAV file of one channel with the bits and the block size that its header states."""
     data = samples.tobytes() if isinstance(samples, np.ndarray) else samples
     size = len(data) if claimed is None else claimed
     riff = size if size == 0xFFFFFFFF else size + 36
     form = struct.pack("<HHIIHH", 1, 1, FS, FS * block, block, bits)
-    return struct.pack("<4sI8sI", b"RIFF", riff, b"WAVEfmt ", 16) + form + struct.pack("<4sI", b"data", size) + data
+    if is_extensible:  # its bits are those of the block; the valid ones follow
+        form = struct.pack("<HHIIHH", 0xFFFE, 1, FS, FS * block, block, 8 * block)
+        form += struct.pack("<HHIIHH8s", 22, bits, 4, 1, 0, 16, b"\x80\0\0\xaa\0\x38\x9b\x71")
+        riff = riff if size == 0xFFFFFFFF else riff + 24
+    head = struct.pack("<4sI8sI", b"RIFF", riff, b"WAVEfmt ", len(form))
+    return head + form + struct.pack("<4sI", b"data", size) + data
 
 
 def low_bits(bits: int, n_bytes: int) -> np.ndarray:
@@ -190,19 +212,21 @@ def low_bits(bits: int, n_bytes: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("bits", "n_bytes"), [(24, 4), (20, 3), (12, 2)])
 @pytest.mark.parametrize("high", [False, True])
-def test_samples_with_more_room_than_bits_keep_their_level(tmp_path, bits, n_bytes, high):
+@pytest.mark.parametrize("is_extensible", [False, True])
+def test_samples_with_more_room_than_bits_keep_their_level(tmp_path, bits, n_bytes, high, is_extensible):
     samples = low_bits(bits, n_bytes)
     if high:
         whole = np.pad(samples, ((0, 0), (0, 4 - n_bytes))).copy().view("<i4") << (8 * n_bytes - bits)
         samples = whole.view(np.uint8).reshape(-1, 4)[:, :n_bytes]
-    (tmp_path / "x.wav").write_bytes(wav(np.ascontiguousarray(samples), bits, n_bytes))
+    content = wav(np.ascontiguousarray(samples), bits, n_bytes, is_extensible=is_extensible)
+    (tmp_path / "x.wav").write_bytes(content)
     level = np.sqrt(np.mean(read_recording(tmp_path / "x.wav").samples ** 2))
     assert level == pytest.approx(0.1 / np.sqrt(2), rel=1e-3)  # 12 bits: steps of 0.5 % of the sine
 
 
 def test_bits_that_do_not_fit_their_block_are_refused(tmp_path):
-    for samples, bits, block in ((low_bits(24, 4), 20, 4), (low_bits(30, 4), 24, 4)):
-        (tmp_path / "x.wav").write_bytes(wav(np.ascontiguousarray(samples), bits, block))
+    for samples, bits, block, longer in ((low_bits(24, 4), 20, 4, False), (low_bits(30, 4), 24, 4, True)):
+        (tmp_path / "x.wav").write_bytes(wav(np.ascontiguousarray(samples), bits, block, is_extensible=longer))
         with pytest.raises(ValueError, match=rf"x\.wav states {bits} bits in blocks of {block} bytes"):
             read_recording(tmp_path / "x.wav")
 
@@ -214,10 +238,31 @@ def test_a_wav_from_a_pipe_is_read_to_its_end(tmp_path, claimed):
     np.testing.assert_array_equal(read_recording(tmp_path / "x.wav").samples, signal())
 
 
-def test_a_recorder_that_was_interrupted_is_named_with_the_remedy(tmp_path):
-    (tmp_path / "x.wav").write_bytes(wav(low_bits(16, 2), 16, 2, claimed=0))
-    with pytest.raises(ValueError, match=r"x\.wav holds no samples: .* in a file of 32044 bytes; .* ffmpeg -i x\.wav "):
+@pytest.mark.parametrize("claimed", [0, 10000])
+def test_a_recorder_that_was_interrupted_is_named_with_the_remedy(tmp_path, claimed):
+    (tmp_path / "x.wav").write_bytes(wav(low_bits(16, 2), 16, 2, claimed=claimed))
+    remedy = rf"goes on for {32000 - claimed} bytes after the end of its samples .* ffmpeg -ignore_length 1 -i x\.wav "
+    with pytest.raises(ValueError, match=rf"x\.wav {remedy}"):
         read_recording(tmp_path / "x.wav")
+
+
+@pytest.mark.parametrize(
+    "after",
+    [
+        b"\0" * 500,
+        b"LIST\x04\0\0\0INFO",
+        b"\0id3 \x02\0\0\0ab",
+        b"TAG" + b"song" * 31 + b"\0",
+        b"\r\n",
+        b"odd \x01\0\0\0x",
+    ],
+)
+@pytest.mark.parametrize("is_counted", [True, False])
+def test_what_follows_the_samples_and_is_no_sound_is_passed_over(tmp_path, after, is_counted):
+    content = wav((signal() * 2**15).astype("<i2"), 16, 2)
+    size = len(content) - 8 + len(after) * is_counted
+    (tmp_path / "x.wav").write_bytes(content[:4] + struct.pack("<I", size) + content[8:] + after)
+    np.testing.assert_array_equal(read_recording(tmp_path / "x.wav").samples, signal())
 
 
 @pytest.mark.parametrize("suffix", ["mp3", "ogg", "opus", "w64", "caf", "au", "m4a", "bin"])
@@ -284,12 +329,26 @@ def test_a_path_from_a_scope_begins_at_its_trigger(tmp_path):
         ({"fs": 8000.0, "dt": 1e-4}, r"states several sampling rates beside 'p', \[8000\.0, 10000\.0\] Hz"),
         ({"t": TIMES**2}, r"has times in uneven steps"),
         ({"dt": 0.0}, r"states a sample interval of 0 s"),
+        (
+            {"Fs": 51.2},
+            r"states a sampling rate of 51\.2 Hz: is it in kHz, .* file_fs=51200 or 51\.2 \(in a command --file-fs\)",
+        ),
+        ({"dt": 1000 / FS}, r"states a sampling rate of 16 Hz: is it in kHz"),
     ],
 )
 def test_rates_that_contradict_are_refused(tmp_path, beside, message):
     scipy.io.savemat(tmp_path / "x.mat", {"p": SIGNAL, **beside})
     with pytest.raises(ValueError, match=rf"x\.mat {message}"):
         read_recording(tmp_path / "x.mat", fs=FS)
+
+
+@pytest.mark.parametrize(("asked", "fs"), [({"file_fs": 48000}, 48000), ({"file_fs": 48}, 48), ({"fs": 48}, 48)])
+@pytest.mark.parametrize("read", [read_path, read_recording])
+def test_a_rate_that_may_be_in_khz_is_confirmed(tmp_path, asked, fs, read):
+    scipy.io.savemat(tmp_path / "x.mat", {"p": SIGNAL, "fs": 48.0})
+    recording = read(tmp_path / "x.mat", **asked)
+    np.testing.assert_array_equal(recording.samples, signal())
+    assert (recording.fs, recording.file_fs) == (fs, 48 if "fs" in asked else None)
 
 
 def test_the_rate_beside_what_cannot_be_read_is_no_signal(tmp_path):

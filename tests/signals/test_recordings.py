@@ -158,20 +158,20 @@ def test_matlab_7_3_has_what_matlab_would_show(tmp_path):
         "0.5\n-0.25\n1.0\n",
         "pressure\n0.5\n-0.25\n1.0\n",
         "# a comment\n\n  0.5 \r\n -0.25\r\n 1.0",
-        "t,p\n0.000,0.5\n0.125,-0.25\n0.250,1.0\n",
-        "t;p\n0,000;0,5\n0,125;-0,25\n0,250;1,0\n",
-        "t\tp\n0,000\t0,5\n0,125\t-0,25\n0,250\t1,0\n",
+        "t,p\n0.000,0.5\n0.00125,-0.25\n0.00250,1.0\n",
+        "t;p\n0,000;0,5\n0,00125;-0,25\n0,00250;1,0\n",
+        "t\tp\n0,000\t0,5\n0,00125\t-0,25\n0,00250\t1,0\n",
         "1,0.5\n2,-0.25\n3,1.0\n",
-        "\ufefft [s], p [Pa]\n0, 5e-1\n.125, -25E-2\n.25, 1\n",
+        "\ufefft [s], p [Pa]\n0, 5e-1\n.00125, -25E-2\n.0025, 1\n",
     ],
 )
 def test_text_of_any_layout_is_read(tmp_path, text):
     has_time = "125" in text
     for encoding in ("utf-8", "utf-16"):
         (tmp_path / "x.txt").write_bytes(text.encode(encoding))
-        recording = read_recording(tmp_path / "x.txt", file_fs=None if has_time else 8)
+        recording = read_recording(tmp_path / "x.txt", file_fs=None if has_time else 800)
         assert recording.samples.tolist() == [0.5, -0.25, 1.0]
-        assert (recording.fs, recording.file_fs) == (8, 8 if has_time else None)
+        assert (recording.fs, recording.file_fs) == (800, 800 if has_time else None)
 
 
 def test_a_first_column_that_is_no_time_is_a_channel(tmp_path):
