@@ -27,8 +27,10 @@ class FastArrayKalman(CoreController):
     Rounding: without forgetting, the weights agree with those of the O(L^2) filter to about 1e-10 over a million
     samples, on white, coloured and band-limited noise. With forgetting, errors grow by 1/lambda per sample until the
     array is lost, after 10 to 20 memories of 1/(1 - lambda) samples: about ten seconds for lambda = 0.9999 at 16 kHz.
-    `update` then raises ValueError, and the weights stay as they were. A narrow band with an `initial_variance` far
-    above `measurement_noise` can spoil the array without forgetting, too.
+    `update` then raises ValueError, and the weights stay as they were. The next sample begins a new array at them, with
+    P = `initial_variance`. A narrow band with an `initial_variance` far above `measurement_noise` can spoil the array
+    without forgetting, too, and so can a reference sample a million times as loud as the others. A huge error leaves
+    the array as it is, but moves the weights, and without forgetting its effect fades only as 1/n over n samples.
 
     With `memory` = N the filter forgets and still runs forever, at less than twice the cost. Two filters without
     forgetting take turns: every N samples one of them is restarted from the weights in use, with
@@ -66,7 +68,7 @@ class FastArrayKalman(CoreController):
     ValueError
         A variance, forgetting factor or memory out of range, a memory beside a forgetting factor, a rated power that is
         not positive and finite, both a rated power and a constraint, fewer than one tap, a path that is not FIR. In a
-        run without `memory`: an array that rounding has corrupted.
+        run without `memory`: an array that rounding or too loud a reference has corrupted, once.
     TypeError
         An amplifier that is not one of the package's models.
 

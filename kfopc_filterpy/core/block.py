@@ -30,8 +30,9 @@ REASONS = {
     LOUD_ESTIMATE: "the disturbance estimate e + s^ * y is too loud, above 1e100: scale the signals",
     LOUD_STEP: "the step of the weights is too large, above 1e50: use a smaller step size",
     NO_SOLUTION: "the covariance P is too large: S = x' P x' + q could overflow",
-    LOST_ARRAY: "the fast array is lost to rounding: this filter cannot go on. Use memory= instead of a forgetting "
-    "factor, or kf_anc, whose O(L^2) form does not lose its covariance",
+    LOST_ARRAY: "the fast array is lost to rounding, or to a reference that was too loud: with the next sample it begins "
+    "again at these weights. Use memory= instead of a forgetting factor, or kf_anc, whose O(L^2) form does not lose its "
+    "covariance",
 }
 
 

@@ -20,7 +20,7 @@
 #include <string.h>
 
 typedef struct { /* of an array */
-    real root;    /* gamma^-1/2; 0: rounding has corrupted the array */
+    real root;    /* gamma^-1/2; 0: rounding or a sample that was too loud has corrupted the array */
     real energy;  /* squared norm of the gain column */
     real heard;   /* samples since the start */
     real trusted; /* samples at the start that leave the weights as they are */
@@ -145,17 +145,27 @@ static void layout_growing(anc_view *view, const anc_plan *plan, const anc_setti
     f->weights = f->s.weights;
 }
 
-static void start_growing(anc_view *view, const anc_plan *plan, const anc_setting *settings)
+static void begin_growing(arrays *f, int32_t trusted)
 {
-    arrays *f = (arrays *)view;
     real fade = 1; /* lambda^L */
-    start_signals(&f->s, plan, settings);
-    begin(f, 0, initial_variance(&f->s), 0);
+    begin(f, 0, initial_variance(&f->s), trusted);
     for (int32_t l = 0; l < f->s.L; l++) fade *= *f->s.setting[FORGETTING];
     f->second[f->s.L] *= root(fade);
 }
 
-static void advance_growing(arrays *f) { advance_array(f, 0, UNUSABLE, *f->s.setting[FORGETTING]); }
+static void start_growing(anc_view *view, const anc_plan *plan, const anc_setting *settings)
+{
+    arrays *f = (arrays *)view;
+    start_signals(&f->s, plan, settings);
+    begin_growing(f, 0);
+}
+
+/* An array that was lost begins again at the weights, as one of a pair does. */
+static void advance_growing(arrays *f)
+{
+    if (f->numbers->root == 0) begin_growing(f, f->s.L - 1);
+    advance_array(f, 0, UNUSABLE, *f->s.setting[FORGETTING]);
+}
 
 static int control_signal_growing(anc_view *view, const real *reference, real *control)
 {

@@ -66,7 +66,7 @@ def test_a_refused_sample_leaves_the_saved_state_as_it_was(name: str, half: str,
 
 
 @pytest.mark.parametrize("half", ["control_signal", "update"])
-@pytest.mark.parametrize("name", [name for name in ALL if not name.startswith("fast-array")])
+@pytest.mark.parametrize("name", ALL)
 def test_a_huge_sample_is_overcome(name: str, half: str) -> None:
     """In a closed loop; 1000 samples later nothing is refused, and nothing is infinite."""
     for value in HUGE:
