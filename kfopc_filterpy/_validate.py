@@ -213,3 +213,8 @@ def as_generator(rng: Any) -> np.random.Generator:
     if rng is None:
         raise TypeError("rng must be a seed or a numpy.random.Generator, so that a run can be repeated; got None")
     return np.random.default_rng(rng)
+
+
+def how_to_install(extra: str) -> str:
+    """Return how to install an extra: the package is on no index, so its clone is named."""
+    return f'install the extra `{extra}`, in the clone: python -m pip install -e ".[{extra}]"'

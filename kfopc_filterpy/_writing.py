@@ -87,6 +87,15 @@ def _exchange(new: Path, folder: Path, old: Path) -> None:
         raise
 
 
+def made_folder(folder: str | os.PathLike[str]) -> Path:
+    """Return a folder, which is made with its parents if it is not there."""
+    path = Path(folder)
+    if path.is_file():
+        raise NotADirectoryError(f"{path} is a file: name a folder")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def require_writable(folder: str | os.PathLike[str]) -> None:
     """Raise OSError if no file can be written in a folder."""
     with tempfile.TemporaryFile(dir=folder):

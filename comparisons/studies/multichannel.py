@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, bench, noise_reduction_db, output_power
+from kfopc_filterpy._validate import how_to_install
 from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, Sound, StudyReport, Table, Tuned, algorithms
 from kfopc_filterpy.plot import curve_style, plot_nse
 
@@ -79,8 +80,8 @@ def main(runs: Runs) -> StudyReport | str:
     """Run the study in the places that are available."""
     if not places():
         return (
-            "multichannel: left out. The built-in room needs pyroomacoustics (pip install kfopc-filterpy[rooms]), the "
-            "measured room its data (KFOPC_DATA)."
+            f"multichannel: left out. The built-in room needs pyroomacoustics ({how_to_install('rooms')}), the measured "
+            "room its data (KFOPC_DATA)."
         )
     rows: list[ChannelRow] = []
     tuned: dict[str, dict[str, Tuned]] = {}

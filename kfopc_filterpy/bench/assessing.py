@@ -33,7 +33,7 @@ from kfopc_filterpy.metrics import (
 )
 from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.analysis import energy_onset
-from kfopc_filterpy.paths.file_checks import require_heard, require_sound
+from kfopc_filterpy.paths.file_checks import require_different, require_heard, require_sound
 from kfopc_filterpy.paths.models import sampling_rate, tells_rate
 from kfopc_filterpy.paths.path_matrix import primary_paths, secondary_paths
 from kfopc_filterpy.paths.uncertainty import Uncertainty
@@ -52,6 +52,7 @@ WEAK_DB = -20.0  # gain of the secondary path, over its mean in the noise's band
 LEAST_RUN_S = 2.0  # its second half then has ten of an amplifier's windows of 0.1 s
 LEAST_TOLERANCE = 0.01  # of the least rated power
 SAME_DB, KEPT = 0.1, 1.02  # runs that differ by less are as good, and a rating that is exceeded by less is kept
+LOUDER_DB, HEARD_DB = 1.0, 40.0  # of a third octave: by how much, and how far below the loudest one at most
 NEARLY_FREE = 1e6  # times the power of the bound: an amplifier without limits
 
 
@@ -242,7 +243,7 @@ def assess(
     if cause == "adaptation" and np.isfinite(least):
         cause = "amplifier"
     figures = {name: _figures(one, limits, fs) for name, one in runs.items()}
-    notes += _on_better_runs(figures, algorithm)
+    notes += _on_better_runs(figures, algorithm) + _on_louder_bands(run)
     if watts is None:
         unknown = "the rating states no impedance" if ohm is None else "volts_per_unit is not known, and taken as 1 V"
         notes.append(f"Powers are mean squares of the control signal, not watts: {unknown}.")
@@ -301,6 +302,7 @@ def recorded_signals(
     require_sound("secondary", s)
     if disturbance is not None:
         d = _recording(disturbance, "disturbance", fs, length=x.shape[1])
+        require_different("disturbance", d, "noise", x)
         if len(d) != K:
             raise ValueError(
                 f"disturbance must have a channel for each of the {K} microphones of secondary, got {len(d)}"
@@ -413,6 +415,23 @@ def _on_better_runs(figures: Mapping[str, Mapping[str, Any]], algorithm: str) ->
                 f"{worst:.2g} times in its worst window."
             )
     return notes
+
+
+def _on_louder_bands(run: SimulationResult) -> list[str]:
+    """Return a note if third octaves that can be heard beside the others are louder with control."""
+    before, after = (
+        np.atleast_2d(third_octave_levels_db(signal, run.fs)[1]) for signal in (run.disturbance, run.error)
+    )
+    centres, _ = third_octave_levels_db(run.error, run.fs)
+    more = np.where(after > before.max() - HEARD_DB, after - before, 0.0).max(axis=0)
+    louder = np.flatnonzero(more > LOUDER_DB)
+    if not louder.size:
+        return []
+    most = louder[np.argmax(more[louder])]
+    return [
+        f"{run.algorithm} makes {louder.size} of {more.size} third octaves louder, most the one at {centres[most]:.3g} Hz: "
+        f"by {more[most]:.1f} dB."
+    ]
 
 
 def _cause(ceilings: Ceilings, want_db: float) -> str:

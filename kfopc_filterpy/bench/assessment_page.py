@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, __version__
+from kfopc_filterpy._validate import how_to_install
 from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
 from kfopc_filterpy.plot.style import new_axes
@@ -37,10 +38,7 @@ def require_page() -> None:
     """Raise ModuleNotFoundError, which names the extra, if a library that the page needs is missing."""
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        raise ModuleNotFoundError(
-            f"the page needs {', '.join(missing)}: install the extra `studies`, "
-            'python -m pip install "kfopc-filterpy[studies]"'
-        )
+        raise ModuleNotFoundError(f"the page needs {', '.join(missing)}: {how_to_install('studies')}")
 
 
 def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Path:

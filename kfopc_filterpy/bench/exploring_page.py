@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy._validate import as_count
+from kfopc_filterpy._validate import as_count, how_to_install
 from kfopc_filterpy.plot.style import decibels
 
 from .exploring import ALGORITHMS, AcousticSetup, ExploreResult, ExploreSettings, explore, explore_setups
@@ -89,9 +89,7 @@ def serve_explore(
         from bokeh.server.server import Server
         from threadpoolctl import threadpool_limits
     except ImportError as error:
-        raise ModuleNotFoundError(
-            'the page needs Bokeh and threadpoolctl: install the extra `explore`, python -m pip install "kfopc-filterpy[explore]"'
-        ) from error
+        raise ModuleNotFoundError(f"the page needs Bokeh and threadpoolctl: {how_to_install('explore')}") from error
     choices = list(explore_setups() if setups is None else setups)
     if not choices:
         raise ValueError("setups must not be empty: leave it out for those that need no files")

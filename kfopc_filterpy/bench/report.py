@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
-from kfopc_filterpy._writing import replacing, replacing_files, require_writable
+from kfopc_filterpy._writing import made_folder, replacing, replacing_files, require_writable
 from kfopc_filterpy.plot import save_figure
 from kfopc_filterpy.signals import write_wav
 
@@ -47,12 +47,11 @@ def prepare_folder(folder: str | os.PathLike[str]) -> Path:
     ...     print(prepare_folder(f"{parent}/new/folder").is_dir())
     True
     """
-    path = Path(folder)
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        path = made_folder(folder)
         require_writable(path)
     except OSError as error:
-        raise OSError(f"folder {str(path)!r} cannot be written ({error}); choose another output folder") from error
+        raise OSError(f"folder {str(folder)!r} cannot be written ({error}); choose another output folder") from error
     return path
 
 

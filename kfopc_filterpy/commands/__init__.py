@@ -1,18 +1,21 @@
 """The command `kfopc`, which is also `python -m kfopc_filterpy`: a file for each subcommand.
 
 Exit codes: 0 if the command is done, or the verdict is "enough"; 1 if the verdict is "not enough", or a fault stopped a
-run; 2 for wrong input, with a message of one line; 130 if it was interrupted.
+run; 2 for wrong input, with a message of one line; 130 if it was interrupted; 141 if its output's reader went away.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import sys
 from collections.abc import Sequence
 
 from . import compare, data, demo, explore, export, paths, run, verdict
 from .options import WRONG_INPUT, Parser
+
+PIPE_CLOSED = 141  # as of a program that SIGPIPE ends
 
 EXAMPLES = """examples:
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --volts-per-unit 10 --want-db 6 -o out
@@ -37,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 done or enough, 1 not enough or stopped by a fault, 2 wrong input, 130 interrupted.
+        0 done or enough, 1 not enough or stopped by a fault, 2 wrong input, 130 interrupted, 141 nobody reads.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     options, unknown = _parser().parse_known_args(
@@ -46,7 +49,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if unknown:
             raise ValueError(f"unrecognized arguments: {' '.join(unknown)}; see {options.prog} --help")
-        return options.run(options)
+        code = options.run(options)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # `head` has read enough; Python would complain at its end of what it cannot write
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return PIPE_CLOSED
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
         print(f"{options.prog}: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
         return WRONG_INPUT

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .._writing import made_folder
 from .options import DONE, Parser, add_command
 
 FS, SECONDS = 16000, 10.0
@@ -40,7 +41,7 @@ def demo(options: argparse.Namespace) -> int:
     files = {options.folder / f"{name}.wav": signal for name, signal in signals.items()}
     if there := [str(path) for path in files if path.exists()]:
         raise FileExistsError(f"{', '.join(there)} would be overwritten: choose another folder")
-    options.folder.mkdir(parents=True, exist_ok=True)
+    made_folder(options.folder)
     for path, signal in files.items():
         write_wav(path, signal, FS)
     noise, d, primary_file, secondary_file = files

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from .._validate import as_choice
+from .._writing import made_folder
 from .inputs import Files
 from .options import DONE, Parser, add_command, add_reading
 
@@ -61,8 +62,7 @@ def export(options: argparse.Namespace) -> int:
         return DONE
     if not fs:
         raise ValueError("an FMU needs the sample rate: give --fs, or fs in the settings file")
-    folder.mkdir(parents=True, exist_ok=True)
-    print(export_fmu(controller, folder / f"{options.name}.fmu", fs=fs, dtype=options.dtype))
+    print(export_fmu(controller, made_folder(folder) / f"{options.name}.fmu", fs=fs, dtype=options.dtype))
     return DONE
 
 

@@ -209,7 +209,7 @@ def _file(path: str) -> Iterator[str]:
 
 def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, Any]:
     """Return noise, primary path, secondary path and disturbance, each with its channels."""
-    from ..paths.file_checks import require_same_length
+    from ..paths.file_checks import require_different, require_same_length
 
     if options.secondary is None:
         raise ValueError("--secondary is needed: the impulse response from control signal to error microphone")
@@ -228,6 +228,7 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, 
     if options.disturbance is not None:
         disturbance = files.channels(options.disturbance)
         require_same_length(options.disturbance, disturbance.shape[-1], options.noise, noise.shape[-1])
+        require_different(options.disturbance, disturbance, options.noise, noise)
         if len(disturbance) != len(secondary):
             raise ValueError(
                 f"--disturbance must have a channel for each of the {len(secondary)} microphone(s) of --secondary, got "

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-EXTRA = 'install the extra `studies`: python -m pip install "kfopc-filterpy[studies]"'
+from .._validate import how_to_install
 
 
 def warn(options: argparse.Namespace, message: str, kind: str = "warning") -> None:
@@ -36,7 +36,7 @@ def progress_bar(options: argparse.Namespace, unit: str) -> Iterator[Any]:
     try:
         from tqdm import tqdm
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"the progress bar needs tqdm: {EXTRA}") from error
+        raise ModuleNotFoundError(f"the progress bar needs tqdm: {how_to_install('studies')}") from error
     quiet = True if options.quiet else None
     with tqdm(unit=unit, unit_scale=True, disable=quiet, dynamic_ncols=True, leave=False) as bar:
         yield bar

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from .._writing import replacing_files
+from .._writing import made_folder, replacing_files
 from ..controllers.base import calls_of
 from ..controllers.core_controller import CoreController
 from ..core.block import Block
@@ -154,7 +154,7 @@ def export_c(
     texts = exported.texts()
     if in_folder:
         texts |= exported.examples()
-        path.parent.mkdir(parents=True, exist_ok=True)
+        made_folder(path.parent)
     with replacing_files(path.parent) as folder:
         for file, text in texts.items():
             (folder / file).write_text(text, encoding="utf-8", newline="\n")

@@ -15,7 +15,7 @@ from xml.sax.saxutils import quoteattr
 
 from numpy.typing import DTypeLike
 
-from .._validate import as_positive
+from .._validate import as_positive, how_to_install
 from .._writing import replacing
 from ..core.building import build
 from .c99 import checked_name, exported_as
@@ -110,9 +110,7 @@ def _headers() -> dict[str, str]:
     """Return the standard's headers, which are FMPy's."""
     found = importlib.util.find_spec("fmpy")
     if found is None or found.origin is None:
-        raise ModuleNotFoundError(
-            "an FMU needs the headers of FMI, which come with FMPy: pip install 'kfopc-filterpy[fmu]'"
-        )
+        raise ModuleNotFoundError(f"an FMU needs the headers of FMI, which come with FMPy: {how_to_install('fmu')}")
     return {name: Path(found.origin).with_name("c-code").joinpath(name).read_text(encoding="utf-8") for name in HEADERS}
 
 

@@ -31,6 +31,16 @@ def require_same_length(disturbance: str, n_samples: int, noise: str, expected: 
         )
 
 
+def require_different(disturbance: str, heard: np.ndarray, noise: str, reference: np.ndarray) -> None:
+    """Raise ValueError if a channel of the disturbance, (n_channels, n_samples), is one of the noise, sample for sample."""
+    for k, i in np.ndindex(len(heard), len(reference)):
+        if np.array_equal(heard[k], reference[i]):
+            raise ValueError(
+                f"channel {k} of {disturbance} is channel {i} of {noise}, sample for sample: is it the error microphone? "
+                "Name its channel, as in recording.wav:1"
+            )
+
+
 def require_heard(name: str, channels: np.ndarray) -> None:
     """Raise ValueError if a channel of a recording, (n_channels, n_samples), is constant."""
     for number, channel in enumerate(channels):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validate import as_count, as_number, as_positive, as_real_array, require_finite
+from .._validate import as_count, as_number, as_positive, as_real_array, how_to_install, require_finite
 
 WALLS = ("west", "east", "south", "north", "floor", "ceiling")
 """Names of the walls: at x = 0 and its maximum, at y = 0 and its maximum, at z = 0 and its maximum."""
@@ -390,6 +390,6 @@ def _pyroomacoustics() -> Any:
         import pyroomacoustics
     except ImportError as error:
         raise ImportError(
-            "room_paths needs pyroomacoustics, which is not installed: python -m pip install 'kfopc-filterpy[rooms]'"
+            f"room_paths needs pyroomacoustics, which is not installed: {how_to_install('rooms')}"
         ) from error
     return pyroomacoustics

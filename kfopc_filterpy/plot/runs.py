@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, as_signal
-from .._writing import replacing
+from .._writing import made_folder, replacing
 from ..metrics import nse_db, short_time_power
 from .results import DISTURBANCE, RATED, Curve, Results, curves, named_styles, one_channel, thinned
 from .style import legend_above, new_axes
@@ -409,7 +409,7 @@ def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> 
         raise ValueError(
             f"path_without_suffix must leave out the suffix, because both files are written; got {str(path)!r}"
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
+    made_folder(path.parent)
     png, svg = (path.with_name(path.name + suffix) for suffix in (".png", ".svg"))
     with mpl.rc_context({"svg.hashsalt": "kfopc_filterpy"}):
         with replacing(png) as file:

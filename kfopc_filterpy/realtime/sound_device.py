@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .._validate import as_count, as_positive
+from .._validate import as_count, as_positive, how_to_install
 from .interfaces import Block
 from .running import FaultError
 
@@ -169,7 +169,7 @@ def _sounddevice() -> Any:
     try:
         import sounddevice
     except ImportError as error:
-        raise ImportError("SoundDevice needs sounddevice: pip install 'kfopc-filterpy[realtime]'") from error
+        raise ImportError(f"SoundDevice needs sounddevice: {how_to_install('realtime')}") from error
     except OSError as error:
         raise ImportError(
             f"sounddevice did not find the PortAudio library ({error}): install it, for example with "

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from .._validate import how_to_install
+
 if TYPE_CHECKING:
     from types import ModuleType
 
@@ -80,7 +82,7 @@ def optional_module(name: str, path: str | os.PathLike[str], what: str) -> Modul
         return import_module(name)
     except ImportError as error:
         raise ModuleNotFoundError(
-            f"{path} is {what}, which needs {name}: install kfopc-filterpy[formats]", name=name
+            f"{path} is {what}, which needs {name}: {how_to_install('formats')}", name=name
         ) from error
 
 

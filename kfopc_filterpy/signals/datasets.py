@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from .._validate import as_choice, as_positive
+from .._validate import as_choice, as_positive, how_to_install
 
 _FOLDER_VARIABLE = "KFOPC_DATA"
 _HOST = "https://raw.githubusercontent.com"
@@ -361,7 +361,7 @@ def _pooch() -> Any:
         import pooch
     except ImportError as error:
         raise DataUnavailableError(
-            "pooch is not installed, so nothing was fetched: install kfopc-filterpy[studies], or set "
+            f"pooch is not installed, so nothing was fetched: {how_to_install('studies')}, or set "
             f"{_FOLDER_VARIABLE} to a folder with the files"
         ) from error
     pooch.get_logger().setLevel("WARNING")  # its announcements would run into a progress bar
