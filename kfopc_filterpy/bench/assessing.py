@@ -302,11 +302,11 @@ def recorded_signals(
     require_sound("secondary", s)
     if disturbance is not None:
         d = _recording(disturbance, "disturbance", fs, length=x.shape[1])
-        require_different("disturbance", d, "noise", x)
         if len(d) != K:
             raise ValueError(
                 f"disturbance must have a channel for each of the {K} microphones of secondary, got {len(d)}"
             )
+        require_different("disturbance", d, "noise", x)
     elif primary is None:
         raise ValueError("primary must be given unless there is a disturbance: what arrives at the error microphone?")
     else:
@@ -429,7 +429,7 @@ def _on_louder_bands(run: SimulationResult) -> list[str]:
         return []
     most = louder[np.argmax(more[louder])]
     return [
-        f"{run.algorithm} makes {louder.size} of {more.size} third octaves louder, most the one at {centres[most]:.3g} Hz: "
+        f"{run.algorithm} makes {louder.size} of {more.size} third octaves louder, most the one at {centres[most]:.0f} Hz: "
         f"by {more[most]:.1f} dB."
     ]
 

@@ -13,6 +13,7 @@ import jsonschema
 import numpy as np
 import pytest
 import soundfile
+from scipy.signal import firwin, welch
 
 from kfopc_filterpy import __version__, noise_reduction_db
 from kfopc_filterpy.bench import algorithms, assess, compare_recordings
@@ -349,6 +350,22 @@ def test_the_levels_are_those_of_the_sounds(written):
     assert less == pytest.approx(verdict.noise_reduction_db, abs=3.0)  # the noise is where A is flat within 3 dB or so
 
 
+def test_a_third_octave_that_the_control_makes_louder_is_noted():
+    """A white reference explains a disturbance of one band; a short filter adds noise beside it."""
+    x = np.random.default_rng(0).standard_normal(3 * FS)
+    verdict = on(x, firwin(41, [400, 900], pass_zero=False, fs=FS), arriving(8, length=16))
+    note = next(note for note in verdict.notes if "third octaves louder" in note)
+    count, centre, more = re.match(r"KF-PB makes (\d+) of \d+ .* at (\d+) Hz: by ([\d.]+) dB\.", note).groups()
+    run = verdict.runs["KF-PB"]
+    half = np.array([run.error, run.disturbance])[:, run.n_samples // 2 :]
+    f, spectra = welch(half, FS, nperseg=2048)
+    band = (f > int(centre) * 2 ** (-1 / 6)) & (f < int(centre) * 2 ** (1 / 6))
+    after, before = spectra[:, band].sum(axis=1)
+    assert float(more) == pytest.approx(10 * np.log10(after / before), abs=1.0)  # their filters' flanks differ
+    assert int(count) > 1
+    assert not any("louder" in note for note in on().notes)
+
+
 # What it refuses.
 
 
@@ -359,6 +376,7 @@ def test_the_levels_are_those_of_the_sounds(written):
         ({"noise": np.ones(8000)}, "noise must not be silent"),
         ({"secondary": np.zeros(8)}, "secondary must not be silent: every value is 0; record it again"),
         ({"primary": None}, "primary must be given unless there is a disturbance"),
+        ({"disturbance": noise()}, "channel 0 of disturbance is channel 0 of noise, sample for sample"),
         ({"disturbance": np.ones(7)}, "disturbance must have 24000 values, got 7"),
         ({"noise": np.full(8000, np.nan)}, "noise must be finite"),
         (

@@ -50,7 +50,11 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
         (["verdict", "empty.wav", *SCENE[1:], "--rated-power", "1"], "empty.wav"),
         (["verdict", "text.wav", *SCENE[1:], "--rated-power", "1"], "cannot be read as an audio file"),
         (["verdict", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "--algorithm must be one of 'KF-PB'"),
-        (["verdict", *SCENE, "--rated-power", "1", "-o", "noise.wav"], "cannot be written"),
+        (["verdict", *SCENE, "--rated-power", "1", "-o", "noise.wav"], "noise.wav is a file: name a folder"),
+        (
+            ["verdict", *SCENE[:1], "--disturbance", "stereo.wav:1", *SCENE[3:], "--rated-power", "1"],
+            "channel 0 of stereo.wav:1 is channel 0 of noise.wav, sample for sample",
+        ),
         (["verdict", *SCENE, "--loudspeaker-watt", "1"], "a loudspeaker's rating needs --ohm"),
         (
             ["verdict", *SCENE, "--rated-power", "1", "--ohm", "8", "--x-max-mm", "1"],
@@ -219,6 +223,17 @@ def test_help_loads_nothing_that_takes_long():
         [sys.executable, "-c", show], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True
     )
     assert shown.stdout.endswith(b"False\n"), shown.stderr
+
+
+def test_a_reader_that_goes_away_ends_the_command_without_a_word():
+    """As `head` does, after it has read enough."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "kfopc_filterpy", "data", "list"], env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
 
 
 def test_a_file_of_one_channel_is_left_alone_by_the_choice_of_a_channel(command):

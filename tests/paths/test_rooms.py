@@ -244,5 +244,5 @@ def test_rooms_refuse(changes, message):
 
 def test_without_pyroomacoustics_the_error_says_what_to_install(uninstall):
     uninstall("pyroomacoustics")
-    with pytest.raises(ImportError, match=r"pip install 'kfopc-filterpy\[rooms\]'"):
+    with pytest.raises(ImportError, match=r"pip install -e .\.\[rooms\]."):
         room_paths(SIZE, **PLACES, absorption=0.5)

@@ -493,7 +493,7 @@ def test_a_card_that_cannot_be_opened_is_named(monkeypatch: pytest.MonkeyPatch) 
 def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(uninstall: Callable[[str], None]) -> None:
     device = SoundDevice([0], [1])
     uninstall("sounddevice")
-    with pytest.raises(ImportError, match=r"kfopc-filterpy\[realtime\]"):
+    with pytest.raises(ImportError, match=r"pip install -e .\.\[realtime\]."):
         device.start()
     for channels, message in ((([], [1]), "reference_channels must be"), (([0], [0]), "must be different inputs")):
         with pytest.raises(ValueError, match=message):

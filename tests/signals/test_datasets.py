@@ -232,7 +232,7 @@ def test_download_without_pooch_says_what_to_install(data_folder, uninstall):
     data_folder(None)
     uninstall("pooch")
     for call in (lambda: load_measured_duct(allow_download=True), lambda: fetch_dataset("duct"), dataset_folder):
-        with pytest.raises(DataUnavailableError, match=r"pooch is not installed.*kfopc-filterpy\[studies\]"):
+        with pytest.raises(DataUnavailableError, match=r"pooch is not installed.*pip install -e .\.\[studies\]."):
             call()
 
 

@@ -506,7 +506,8 @@ def test_without_its_library_the_error_names_the_extra(name, library, tmp_path, 
     WRITERS[name](tmp_path / name)
     uninstall(library)
     with pytest.raises(
-        ModuleNotFoundError, match=rf"{name} is .* which needs {library}: install kfopc-filterpy\[formats\]"
+        ModuleNotFoundError,
+        match=rf"{name} is .* which needs {library}: install the extra `formats`, .*pip install -e .\.\[formats\].",
     ):
         read_recording(tmp_path / name)
 
