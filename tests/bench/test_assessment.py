@@ -326,6 +326,7 @@ def test_the_page_needs_no_other_file_and_says_the_verdict(written):
     assert all(source.startswith("data:") for source in sources)
     assert not re.search(r'(?:href|src)="(?:https?:)?//', text)
     assert verdict.verdict in text
+    assert text.index(verdict.verdict) < text.index("<li>noise lasts only 3 s") < text.index("<figure")
     for stem in re.findall(r'href="([^"#]+)"', text):
         assert (page.parent / stem).is_file()
 
