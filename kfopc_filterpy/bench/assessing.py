@@ -419,17 +419,17 @@ def _on_better_runs(figures: Mapping[str, Mapping[str, Any]], algorithm: str) ->
 
 def _on_louder_bands(run: SimulationResult) -> list[str]:
     """Return a note if third octaves that can be heard beside the others are louder with control."""
-    before, after = (
-        np.atleast_2d(third_octave_levels_db(signal, run.fs)[1]) for signal in (run.disturbance, run.error)
-    )
-    centres, _ = third_octave_levels_db(run.error, run.fs)
-    more = np.where(after > before.max() - HEARD_DB, after - before, 0.0).max(axis=0)
-    louder = np.flatnonzero(more > LOUDER_DB)
-    if not louder.size:
+    try:
+        (centres, before), (_, after) = (third_octave_levels_db(one, run.fs) for one in (run.disturbance, run.error))
+    except ValueError:  # none is below half of such a low rate
         return []
-    most = louder[np.argmax(more[louder])]
+    more = np.subtract(after, before, where=after > np.max(before) - HEARD_DB, out=np.zeros_like(after))
+    more = np.atleast_2d(more).max(axis=0)
+    count, most = np.count_nonzero(more > LOUDER_DB), np.argmax(more)
+    if not count:
+        return []
     return [
-        f"{run.algorithm} makes {louder.size} of {more.size} third octaves louder, most the one at {centres[most]:.0f} Hz: "
+        f"{run.algorithm} makes {count} of {more.size} third octaves louder, most the one at {centres[most]:.0f} Hz: "
         f"by {more[most]:.1f} dB."
     ]
 

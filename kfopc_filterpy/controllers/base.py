@@ -111,9 +111,9 @@ def _alone(step: Callable[..., Any]) -> Callable[..., Any]:
     """Return a method of a wrapper that a second thread cannot enter."""
 
     @wraps(step)
-    def guarded(wrapper: Any, *arguments: Any) -> Any:
+    def guarded(wrapper: Any, *arguments: Any, **named: Any) -> Any:
         with wrapper.in_use:
-            return step(wrapper, *arguments)
+            return step(wrapper, *arguments, **named)
 
     return guarded
 

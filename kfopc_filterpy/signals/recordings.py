@@ -210,7 +210,8 @@ def read_recording(
     ValueError, TypeError
         If the file is empty, cut short, damaged, claims more than it has, or holds NaN or Inf; if it holds several variables
         and none is chosen, or no such variable or channel; if no sampling rate is known, or `file_fs` is another than
-        the file's; if the file states a rate below 300 Hz and neither `fs` nor `file_fs` confirms it; if the rates are in no ratio of whole numbers; if a scale comes without its unit.
+        the file's; if the file states a rate below 300 Hz and neither `fs` nor `file_fs` confirms it; if the rates are in
+        no ratio of whole numbers; if a scale comes without its unit.
 
     See Also
     --------
