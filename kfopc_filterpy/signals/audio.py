@@ -34,7 +34,9 @@ def read_audio(path: str | os.PathLike[str]) -> Content:
     """Return the samples of an audio file, full scale 1, and its sampling rate."""
     import soundfile
 
-    convert = f"convert it to WAV, for example with: ffmpeg -i {Path(path).name} {Path(path).stem}-pcm.wav"
+    convert = (
+        f"convert it to WAV, for example with: ffmpeg -i {Path(path).name} -c:a pcm_f32le {Path(path).stem}-pcm.wav"
+    )
     bits = _require_whole(path)
     try:
         file = soundfile.SoundFile(path)
@@ -81,11 +83,10 @@ def _require_whole(path: str | os.PathLike[str]) -> _Bits | None:
     if claimed > held:
         raise ValueError(f"{path} is cut short: its header claims {claimed} bytes, {held} are there")
     if more:
-        name, other = Path(path).name, f"{Path(path).stem}-pcm.wav"
+        copy = f"-i {Path(path).name} -c copy {Path(path).stem}-pcm.wav"
         raise ValueError(
             f"{path} goes on for {more} bytes after the end of its samples that its header states: was the recorder "
-            f"interrupted? Read them with ffmpeg -ignore_length 1 -i {name} {other}, or leave them out with ffmpeg -i "
-            f"{name} {other}"
+            f"interrupted? Read them with ffmpeg -ignore_length 1 {copy}, or leave them out with ffmpeg {copy}"
         )
     return spared
 
