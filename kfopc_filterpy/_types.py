@@ -24,6 +24,8 @@ System: TypeAlias = "control.TransferFunction | control.StateSpace"
 PathModel: TypeAlias = "ArrayLike | System"
 # One path, or several: taps (outputs, inputs, n_taps), a system with several channels, or rows of systems.
 PathModels: TypeAlias = "PathModel | Sequence[Sequence[System]]"
+# What stays, or pairs of a time in s and what holds from it on; see `simulate`.
+ChangingPaths: TypeAlias = "PathModels | Sequence[tuple[float, PathModels]]"
 
 
 class Counter(Protocol):

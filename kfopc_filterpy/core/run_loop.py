@@ -88,6 +88,8 @@ class Record(NamedTuple):
 class Plant:
     """The true amplifiers and paths, which start silent.
 
+    `secondary`, `feedback` and `amplifiers` may be changed between two samples; the delay lines go on.
+
     Parameters
     ----------
     secondary : ndarray, shape (S, K, J, taps)
@@ -116,18 +118,23 @@ class Plant:
         longest = max(taps, feedback.shape[2])
         length = 4 * longest + 64
         self.reference, self.control, self.error = np.zeros(len(feedback)), np.zeros(S * J), np.zeros(S * K)
-        self.limit, self._models = np.ascontiguousarray(limit, np.float64), np.ascontiguousarray(amplifiers)
-        self._arrays = [
-            *(np.array(array, order="C") for array in (secondary, feedback)),
-            self._models,
-            np.zeros((S * J, length)),
+        self.limit = np.ascontiguousarray(limit, np.float64)
+        self.secondary, self.feedback, self.amplifiers = (
+            np.array(array, order="C") for array in (secondary, feedback, amplifiers)
+        )
+        self._output = np.zeros((S * J, length))
+        arrays = [
+            self.secondary,
+            self.feedback,
+            self.amplifiers,
+            self._output,
             self.reference,
             self.control,
             self.error,
             self.limit,
         ]
         counts = (S, K, J, len(feedback), taps, feedback.shape[2], length - longest, length)
-        self._struct = _Plant(*counts, *(array.ctypes.data for array in self._arrays))
+        self._struct = _Plant(*counts, *(array.ctypes.data for array in arrays))
 
     def run(
         self, steps: Steps, signals: Signals, records: list[Record], begin: int, end: int, status: int = RUNNING
@@ -153,9 +160,9 @@ class Plant:
 
     def silence(self, scenario: int) -> None:
         """Cut off the loudspeakers of a scenario."""
-        loudspeakers = self._arrays[0].shape[2]
+        loudspeakers = self.secondary.shape[2]
         rows = slice(scenario * loudspeakers, (scenario + 1) * loudspeakers)
-        self._arrays[0][scenario] = self._arrays[3][rows] = self.control[rows] = 0.0
+        self.secondary[scenario] = self._output[rows] = self.control[rows] = 0.0
 
     def hear(self, signals: Signals, n: int) -> NDArray[np.float64]:
         """Return the references of sample n, (I,)."""
@@ -166,7 +173,7 @@ class Plant:
         """Return the outputs of the amplifier models for control signals, (J,)."""
         y, out = np.ascontiguousarray(y), np.empty(y.size)
         for j in range(y.size):
-            amplify_all(self._models[j].ctypes.data, y[j:].ctypes.data, out[j:].ctypes.data, 1)
+            amplify_all(self.amplifiers[j].ctypes.data, y[j:].ctypes.data, out[j:].ctypes.data, 1)
         return out
 
     def play(self, amplified: NDArray[np.float64], signals: Signals, n: int) -> NDArray[np.float64]:

@@ -2,44 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import fftconvolve
 
-from .._types import PathModels, Seed
+from .._types import ChangingPaths, Seed
 from .._validate import as_channels, as_generator, as_nonnegative, as_signal
 from ..paths.models import path_taps
 from ..paths.path_matrix import primary_paths
+from .schedule import path_schedule
 
 DIVERGENCE_LIMIT = 1e6  # a run stops if the control signal exceeds this multiple of sqrt(rated power)
 
 
 def disturbance_at_microphone(
-    x: np.ndarray, primary_path: PathModels | None, disturbance: ArrayLike | None, fs: float
+    x: np.ndarray,
+    primary_path: ChangingPaths | None,
+    disturbance: ArrayLike | None,
+    fs: float,
+    crossfade_s: float = 0.0,
 ) -> np.ndarray:
     """Return the disturbance d, (n_samples,), as given or as p*x."""
     require_one_source(primary_path, disturbance)
     if disturbance is not None:
         return as_signal(disturbance, "disturbance", length=x.size)
-    return np.convolve(x, path_taps(primary_path, fs=fs, name="primary_path"))[: x.size]
+
+    def read(path: Any) -> np.ndarray:
+        return path_taps(path, fs=fs, name="primary_path")
+
+    return _through(x, primary_path, read, np.convolve, fs, crossfade_s)
 
 
 def channel_disturbances(
-    x: np.ndarray, primary_path: PathModels | None, disturbance: ArrayLike | None, fs: float, n_microphones: int
+    x: np.ndarray,
+    primary_path: ChangingPaths | None,
+    disturbance: ArrayLike | None,
+    fs: float,
+    n_microphones: int,
+    crossfade_s: float = 0.0,
 ) -> np.ndarray:
     """Return the disturbances, (K, n_samples), as given or as the sum of p_ki * x_i."""
     require_one_source(primary_path, disturbance)
-    if primary_path is not None:
-        primary, _ = primary_paths(primary_path, fs=fs)
+
+    def read(paths: Any) -> np.ndarray:
+        primary, _ = primary_paths(paths, fs=fs)
         if primary.shape[:2] != (n_microphones, len(x)):
             raise ValueError(
                 f"primary_path must be (K microphones, I references, taps) with K = {n_microphones} of secondary_path "
                 f"and I = {len(x)} of reference, got {primary.shape}"
             )
-        return np.array([fftconvolve(x, p, axes=-1).sum(axis=0)[: x.shape[1]] for p in primary])
+        return primary
+
+    def convolve(x: np.ndarray, primary: np.ndarray) -> np.ndarray:
+        return np.array([fftconvolve(x, p, axes=-1).sum(axis=0) for p in primary])
+
+    if primary_path is not None:
+        return _through(x, primary_path, read, convolve, fs, crossfade_s)
     d = np.atleast_2d(as_channels(disturbance, "disturbance"))
     if d.shape != (n_microphones, x.shape[1]):
         raise ValueError(
@@ -48,7 +70,26 @@ def channel_disturbances(
     return d
 
 
-def require_one_source(primary_path: PathModels | None, disturbance: ArrayLike | None) -> None:
+def _through(
+    x: np.ndarray,
+    primary_path: Any,
+    read: Callable[[Any], np.ndarray],
+    convolve: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    fs: float,
+    crossfade_s: float,
+) -> np.ndarray:
+    """Return what comes through paths that may change; what is on its way then arrives by the new ones."""
+    n_samples = x.shape[-1]
+    paths = path_schedule(primary_path, "primary_path", read, n_samples, fs, crossfade_s)
+    d = np.zeros((*paths.values[0].shape[:-2], n_samples))
+    for taps, part, share in paths.parts(n_samples):
+        first = max(part.start - taps.shape[-1] + 1, 0)
+        heard = convolve(x[..., first : part.stop], taps)
+        d[..., part] += share * heard[..., part.start - first : part.stop - first]
+    return d
+
+
+def require_one_source(primary_path: ChangingPaths | None, disturbance: ArrayLike | None) -> None:
     """Raise ValueError unless exactly one of the two is given."""
     if (primary_path is None) == (disturbance is None):
         raise ValueError("give either primary_path= or disturbance=, not both and not neither")

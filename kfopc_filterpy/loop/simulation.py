@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import PathModels, PerLoudspeaker, Seed
-from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
+from .._types import ChangingPaths, PerLoudspeaker, Seed
+from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_loudspeaker
 from ..controllers.base import Controller, Looped, checked_controller, differing_counts, listening
 from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
 from ..paths.models import path_taps, sampling_rate
 from ..paths.path_matrix import feedback_paths, is_path_matrix, secondary_paths
-from ..power.amplifiers import Amplifier, amplifier_models, amplifier_of_each, compiled_model
+from ..power.amplifiers import Amplifiers, amplifier_models, amplifier_of_each, compiled_model
 from ..power.constraint import DEFAULT_FS
 from ..signals.recordings import Recording
 from .inputs import (
@@ -29,26 +29,31 @@ from .inputs import (
     switch_on_sample,
 )
 from .result import SimulationResult
+from .schedule import Schedule, as_schedule, path_schedule, steps
 
 STRETCH = 1600  # samples between two reports of progress, or two opportunities to interrupt a run: 0.1 s at 16 kHz
 RECORDED = ("constraint_factor",)
 POWERS = ("disturbance_power", "secondary_path_gain", "power_weight")  # recorded on request, for one channel
+
+ChangingAmplifiers: TypeAlias = Amplifiers | Sequence[tuple[float, Amplifiers]]
 
 
 def simulate(
     controller: Controller,
     reference: ArrayLike,
     *,
-    secondary_path: PathModels,
-    primary_path: PathModels | None = None,
+    secondary_path: ChangingPaths,
+    primary_path: ChangingPaths | None = None,
     disturbance: ArrayLike | None = None,
     fs: float = DEFAULT_FS,
-    amplifier: Amplifier | Sequence[Amplifier | None] | None = None,
+    amplifier: ChangingAmplifiers = None,
     rated_power: PerLoudspeaker | None = None,
     sensor_noise_std: float = 0.0,
     rng: Seed | None = None,
     switch_on_s: float = 0.0,
-    feedback_path: PathModels | None = None,
+    feedback_path: ChangingPaths | None = None,
+    noise_level_db: float | Sequence[tuple[float, float]] = 0.0,
+    crossfade_s: float = 0.0,
     record_weights_every: int | None = None,
     record_powers: bool = False,
     progress: Callable[[int], Any] | None = None,
@@ -63,6 +68,11 @@ def simulate(
     With several channels, the channel is the leading axis: I references, J loudspeakers, K error microphones. A
     user-defined controller then gets and returns arrays: ``control_signal(reference)``, (I,), returns (J,), and
     ``update(error)`` gets (K,).
+
+    Paths, amplifiers and the level of the noise may change during the run. Give pairs (time in s, value) in place of a
+    value, such as ``secondary_path=[(0.0, closed), (3.5, opened)]``. The times count from the start of `reference`,
+    begin with 0 and rise; the value holds from the sample ``round(time * fs)`` on. The delay lines go on: what is on
+    its way when a path changes arrives by the new one.
 
     Parameters
     ----------
@@ -82,7 +92,8 @@ def simulate(
         Sample rate in Hz; paths given as systems must have the same.
     amplifier : callable, optional
         Amplifier model, or any function of a sample that returns a finite number; by default linear. With several
-        loudspeakers one for all, or a sequence with one for each.
+        loudspeakers one for all, or a sequence with one for each. One with memory, such as
+        `power.ExcursionLimitedLoudspeaker`, has a method ``at_rest()`` that returns the copy used in the run.
     rated_power : float or array_like, optional
         Rated power, which sets the scale of the divergence limit, of all loudspeakers or of each, (J,); by default the
         controller's, or 1 if it has none.
@@ -97,6 +108,12 @@ def simulate(
     feedback_path : array_like or control.TransferFunction, optional
         Acoustic feedback from the amplifier to the reference microphone, (I, J, n_taps) with several; its first tap must
         be 0. By default none.
+    noise_level_db : float, default 0
+        Gain of `reference` in dB, and with `primary_path` so of the disturbance; not together with `disturbance`.
+    crossfade_s : float, default 0
+        Time in s from the beginning to the end of a change of the paths or the level, at most the shortest time between
+        two of them. Meanwhile the taps, or the gains, are interpolated linearly between the old and the new, for each
+        sample. 0 switches at once; amplifiers are always switched.
     record_weights_every : int, optional
         Record the control filter (a controller's `control_filter`, or else its `weights`) every so many samples.
     record_powers : bool, default False
@@ -116,7 +133,8 @@ def simulate(
     ------
     ValueError
         Signals that are empty, not finite or of different lengths; sample rates that differ; both or neither of
-        `primary_path` and `disturbance`; a feedback path without delay. Nothing was changed. During a run: an amplifier
+        `primary_path` and `disturbance`; a feedback path without delay; times that do not begin with 0, do not rise or
+        are beyond the run. Nothing was changed. During a run: an amplifier
         that returns NaN, or an update without a solution (a covariance that is too large).
     TypeError
         A controller without `control_signal` and `update`, or an amplifier that is not a function.
@@ -130,6 +148,14 @@ def simulate(
     >>> result = simulate(controller, x, secondary_path=[0.0, 1.0], primary_path=[0.0, 0.0, 0.0, 1.0])
     >>> bool(np.mean(result.control_signal[8000:] ** 2) < 1.02 * 0.25)  # unconstrained it would be 1
     True
+
+    The primary path is five samples longer after half a second:
+
+    >>> later = simulate(
+    ...     controller, x, secondary_path=[0.0, 1.0], primary_path=[(0.0, np.eye(4)[3]), (0.5, np.eye(9)[8])]
+    ... )
+    >>> bool(np.all(later.disturbance[8000:] == x[7992:-8]))
+    True
     """
     checked_controller(controller)
     fs = as_positive(fs, "fs", unit="Hz")
@@ -137,8 +163,10 @@ def simulate(
         if isinstance(signal, Recording):
             sampling_rate(signal, fs, name=name)
     several = is_multichannel(controller, reference, secondary_path, disturbance)
-    x, d, secondary = _read_signals(reference, primary_path, disturbance, secondary_path, fs, several)
-    K, J, _ = secondary.shape
+    x, d, secondary = _read_signals(
+        reference, noise_level_db, primary_path, disturbance, secondary_path, fs, crossfade_s, several
+    )
+    K, J, _ = secondary.values[0].shape
     _require_fit(controller, len(x), J, K, several)
     noise = SensorNoise(sensor_noise_std, rng)
     rated: Any = getattr(controller, "rated_power", None) if rated_power is None else rated_power
@@ -146,8 +174,9 @@ def simulate(
         rated = per_loudspeaker(rated, J, "rated_power") if several else as_positive(rated, "rated_power")
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = switch_on_sample(switch_on_s, fs, x.shape[1])
-    functions, models = _amplifiers(amplifier, J)
-    feedback = _feedback(feedback_path, fs, len(x), J, several)
+    n_samples = x.shape[1]
+    amplifiers = as_schedule(steps(amplifier, "amplifier"), "amplifier", lambda one: _amplifiers(one, J), n_samples, fs)
+    feedback = _feedback(feedback_path, fs, len(x), J, several, n_samples, crossfade_s)
     if hasattr(controller, "require_sample_rate"):
         controller.require_sample_rate(fs)
     weights = _weight_rows(x.shape[1] - on, controller, every, several)
@@ -157,9 +186,9 @@ def simulate(
         x, d = x[:, on:], d[:, on:]
 
     plant = Plant(
-        secondary[None],
-        feedback,
-        models,
+        secondary.values[0][None],
+        feedback.values[0],
+        amplifiers.values[0][1],
         DIVERGENCE_LIMIT * np.sqrt(np.ones(J) if rated is None else np.broadcast_to(rated, J)),
     )
     n_samples = x.shape[1]
@@ -167,9 +196,22 @@ def simulate(
     signals = Signals(np.ascontiguousarray(x), np.ascontiguousarray(d), noise.filled(results[0]), *results)
     wanted = RECORDED + (POWERS if record_powers and not several else ())
     recorded = {name: np.full((J, n_samples), np.nan) for name in wanted}
-    run = _Run(controller, plant, signals, recorded, weights, every or 1, functions, several, progress)
+    run = _Run(
+        controller,
+        plant,
+        secondary,
+        feedback,
+        amplifiers,
+        on,
+        signals,
+        recorded,
+        weights,
+        every or 1,
+        several,
+        progress,
+    )
     looped = None
-    if compiled and isinstance(controller, CoreController) and not any(functions):
+    if compiled and isinstance(controller, CoreController) and not any(any(own) for own, _ in amplifiers.values):
         looped = controller.looped()
     with getattr(controller, "in_use", nullcontext()):
         diverged, end = run.steps(x) if looped is None else run.loop(looped)
@@ -202,13 +244,24 @@ class _Run:
 
     controller: Any
     plant: Plant
+    secondary: Schedule  # of (K, J, taps)
+    feedback: Schedule  # of (I, J, taps)
+    amplifiers: Schedule  # of what `_amplifiers` returns
+    on: int  # first sample of the run in the times of the schedules
     signals: Signals
     recorded: dict[str, np.ndarray]  # (J, n_samples)
     weights: np.ndarray  # (rows, ...)
     every: int
-    functions: list[Any]  # for each loudspeaker: an amplifier that is not a model, or None
     several: bool
     progress: Callable[[int], Any] | None
+    functions: list[Any] = field(init=False)  # for each loudspeaker: an amplifier that is not a model, or None
+
+    def set_plant(self, n: int) -> int:
+        """Make the plant what it is at sample n; return the first sample after it at which it may be another one."""
+        self.plant.secondary[0], one = self.secondary.at(n + self.on)
+        self.plant.feedback[:], other = self.feedback.at(n + self.on)
+        (self.functions, self.plant.amplifiers[:]), last = self.amplifiers.at(n + self.on)
+        return min(one, other, last) - self.on
 
     def loop(self, looped: Looped) -> tuple[bool, int]:
         """Run in the core, stretch by stretch: a run can be interrupted between them."""
@@ -219,7 +272,7 @@ class _Run:
             records.append(Record(looped.control_filter.reshape(-1), rows, self.every, in_rows=True))
         status, begin, n_samples = RUNNING, 0, self.signals.error.shape[1]
         while begin < n_samples and status == RUNNING:
-            end = min(begin + STRETCH, n_samples)
+            end = min(begin + STRETCH, self.set_plant(begin), n_samples)
             status, done = self.plant.run(looped.steps, self.signals, records, begin, end)
             if self.progress:
                 self.progress(done - begin)
@@ -234,7 +287,10 @@ class _Run:
 
     def steps(self, x: np.ndarray) -> tuple[bool, int]:
         """Call the controller for each sample; return whether it diverged, and the first sample not completed."""
+        changes = 0
         for n in range(x.shape[1]):
+            if n == changes:
+                changes = self.set_plant(n)
             with naming_sample(n):
                 y = self._control_signal(self.plant.hear(self.signals, n))
                 if not np.all(np.abs(y) <= self.plant.limit):
@@ -277,12 +333,17 @@ class _Run:
 
 
 def is_multichannel(
-    controller: object, reference: ArrayLike, secondary_path: PathModels, disturbance: ArrayLike | None
+    controller: object, reference: ArrayLike, secondary_path: ChangingPaths, disturbance: ArrayLike | None
 ) -> bool:
     """Return whether a run has several channels: its controller, one of its signals or its secondary paths say so."""
     own = isinstance(controller, CoreController) and controller.multichannel
     heard: Any = disturbance
-    return own or np.ndim(reference) == 2 or np.ndim(heard) == 2 or is_path_matrix(secondary_path)
+    return (
+        own
+        or np.ndim(reference) == 2
+        or np.ndim(heard) == 2
+        or any(is_path_matrix(path) for _, path in steps(secondary_path, "secondary_path"))
+    )
 
 
 def filters_of(controller: object) -> Any:
@@ -299,29 +360,66 @@ def _as_sample(value: Any, source: str) -> float:
 
 
 def _read_signals(
-    reference: Any, primary_path: Any, disturbance: Any, secondary_path: Any, fs: float, several: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    reference: Any,
+    noise_level_db: Any,
+    primary_path: Any,
+    disturbance: Any,
+    secondary_path: Any,
+    fs: float,
+    crossfade_s: float,
+    several: bool,
+) -> tuple[np.ndarray, np.ndarray, Schedule]:
     """Return references (I, n), disturbances (K, n) and secondary paths (K, J, taps)."""
+    x = np.atleast_2d(as_channels(reference, "reference") if several else as_signal(reference, "reference"))
+    x = x * _gain(noise_level_db, x.shape[1], fs, crossfade_s, disturbance)
+
+    def read(paths: Any) -> np.ndarray:
+        if several:
+            return secondary_paths(paths, fs=fs)[0]
+        return path_taps(paths, fs=fs, name="secondary_path").reshape(1, 1, -1)
+
+    secondary = path_schedule(secondary_path, "secondary_path", read, x.shape[1], fs, crossfade_s)
     if several:
-        x = np.atleast_2d(as_channels(reference, "reference"))
-        secondary, _ = secondary_paths(secondary_path, fs=fs)
-        return x, channel_disturbances(x, primary_path, disturbance, fs, len(secondary)), secondary
-    x = as_signal(reference, "reference")
-    d = disturbance_at_microphone(x, primary_path, disturbance, fs)
-    return x[None], d[None], path_taps(secondary_path, fs=fs, name="secondary_path").reshape(1, 1, -1)
+        K = len(secondary.values[0])
+        return x, channel_disturbances(x, primary_path, disturbance, fs, K, crossfade_s), secondary
+    return x, disturbance_at_microphone(x[0], primary_path, disturbance, fs, crossfade_s)[None], secondary
 
 
-def _feedback(feedback_path: Any, fs: float, n_references: int, J: int, several: bool) -> np.ndarray:
+def _gain(noise_level_db: Any, n_samples: int, fs: float, crossfade_s: float, disturbance: Any) -> np.ndarray:
+    """Return the gain of the noise in each sample."""
+
+    def read(level_db: Any) -> float:
+        level = as_number(level_db, "noise_level_db", unit="dB")
+        if level and disturbance is not None:
+            raise ValueError(
+                "noise_level_db needs primary_path=, by which the disturbance follows; if you give the disturbance, "
+                "scale both signals yourself, with signals.level_jump for example"
+            )
+        return float(10 ** (level / 20))
+
+    pairs, gain = steps(noise_level_db, "noise_level_db", of_numbers=True), np.zeros(n_samples)
+    for value, part, share in as_schedule(pairs, "noise_level_db", read, n_samples, fs, crossfade_s).parts(n_samples):
+        gain[part] += share * value
+    return gain
+
+
+def _feedback(
+    feedback_path: Any, fs: float, n_references: int, J: int, several: bool, n_samples: int, crossfade_s: float
+) -> Schedule:
     """Return the feedback paths, (I, J, taps); 0 taps without any."""
-    if feedback_path is None:
-        return np.zeros((n_references, J, 0))
-    feedback, _ = feedback_paths(feedback_path, several, fs)
-    if feedback.shape[:2] != (n_references, J):
-        raise ValueError(
-            f"feedback_path must be (I references, J loudspeakers, taps) with I = {n_references}, J = {J}, "
-            f"got {feedback.shape}"
-        )
-    return feedback
+
+    def read(paths: Any) -> np.ndarray:
+        if paths is None:
+            return np.zeros((n_references, J, 0))
+        feedback, _ = feedback_paths(paths, several, fs)
+        if feedback.shape[:2] != (n_references, J):
+            raise ValueError(
+                f"feedback_path must be (I references, J loudspeakers, taps) with I = {n_references}, J = {J}, "
+                f"got {feedback.shape}"
+            )
+        return feedback
+
+    return path_schedule(feedback_path, "feedback_path", read, n_samples, fs, crossfade_s)
 
 
 def _amplifiers(amplifier: Any, J: int) -> tuple[list[Any], np.ndarray]:
