@@ -135,6 +135,8 @@ class Plant:
         ]
         counts = (S, K, J, len(feedback), taps, feedback.shape[2], length - longest, length)
         self._struct = _Plant(*counts, *(array.ctypes.data for array in arrays))
+        self._signals: Signals | None = None
+        self._passed: _Signals
 
     def run(
         self, steps: Steps, signals: Signals, records: list[Record], begin: int, end: int, status: int = RUNNING
@@ -149,7 +151,7 @@ class Plant:
         done = _library.anc_run(
             ctypes.byref(_Controller(*steps)),
             ctypes.byref(self._struct),
-            ctypes.byref(_pointers(signals)),
+            self._pointers(signals),
             notes,
             ctypes.c_int32(len(records)),
             ctypes.c_int64(begin),
@@ -164,9 +166,16 @@ class Plant:
         rows = slice(scenario * loudspeakers, (scenario + 1) * loudspeakers)
         self.secondary[scenario] = self._output[rows] = self.control[rows] = 0.0
 
+    def _pointers(self, signals: Signals) -> Any:
+        """Return the signals as the core takes them; made once, because a run calls the core for single samples too."""
+        if signals is not self._signals:
+            pointers = (None if signal is None else signal.ctypes.data for signal in signals)
+            self._signals, self._passed = signals, _Signals(signals.disturbance.shape[1], *pointers)
+        return ctypes.byref(self._passed)
+
     def hear(self, signals: Signals, n: int) -> NDArray[np.float64]:
         """Return the references of sample n, (I,)."""
-        _library.anc_hear(ctypes.byref(self._struct), ctypes.byref(_pointers(signals)), ctypes.c_int64(n))
+        _library.anc_hear(ctypes.byref(self._struct), self._pointers(signals), ctypes.c_int64(n))
         return self.reference
 
     def amplified(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -182,15 +191,10 @@ class Plant:
         _library.anc_play(
             ctypes.byref(self._struct),
             ctypes.c_void_p(self.control.ctypes.data),
-            ctypes.byref(_pointers(signals)),
+            self._pointers(signals),
             ctypes.c_int64(n),
         )
         return self.error
-
-
-def _pointers(signals: Signals) -> _Signals:
-    pointers = (None if signal is None else signal.ctypes.data for signal in signals)
-    return _Signals(signals.disturbance.shape[1], *pointers)
 
 
 def process(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import PathModels, Seed
+from .._types import ChangingPaths, PathModels, Seed
 from .._validate import as_positive, as_signal
 from ..controllers.core_controller import RECORDED as IN_CONSTRAINT
 from ..controllers.core_controller import CoreController
@@ -21,6 +21,7 @@ from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS, NUMBERS
 from .inputs import DIVERGENCE_LIMIT, SensorNoise, disturbance_at_microphone, switch_on_sample
 from .result import SimulationResult
+from .schedule import steps
 from .simulation import POWERS, RECORDED, STRETCH
 
 RESULTS = ("error", "control_signal", "amplifier_output", "anti_noise")
@@ -46,7 +47,7 @@ def simulate_scenarios(
     reference: ArrayLike,
     *,
     secondary_path: PathModels,
-    primary_path: PathModels | None = None,
+    primary_path: ChangingPaths | None = None,
     disturbance: ArrayLike | None = None,
     fs: float = DEFAULT_FS,
     amplifier: Amplifier | Sequence[Amplifier | None] | None = None,
@@ -76,7 +77,8 @@ def simulate_scenarios(
     secondary_path : array_like, control.TransferFunction or list of them
         True secondary path, one for all or a list with one each.
     primary_path : array_like or control.TransferFunction, optional
-        Path from the reference to the error microphone, which gives the disturbance of all.
+        Path from the reference to the error microphone, which gives the disturbance of all. It may be switched during
+        the run, as in `simulate`; the other paths and the amplifiers stay the same here.
     disturbance : array_like, optional
         (n_samples,) disturbance of all, or (n_scenarios, n_samples), in place of `primary_path`.
     fs : float, default 16000
@@ -130,6 +132,9 @@ def simulate_scenarios(
     x = as_signal(reference, "reference").copy()  # the results keep it, read-only
     if isinstance(controllers, CoreController):
         raise TypeError("controllers must be a sequence of controllers: [controller] for one")
+    for name, value in (("secondary_path", secondary_path), ("amplifier", amplifier)):
+        if steps(value, name)[0][1] is not value:
+            raise ValueError(f"{name} must stay the same for scenarios: use simulate for one that changes")
     controllers = list(controllers)
     blocks = _blocks_that_share(controllers, fs)
     count = len(controllers)
