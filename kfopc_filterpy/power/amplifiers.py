@@ -1,4 +1,4 @@
-"""Loudspeaker amplifier models, memoryless: linear, hard clip, soft saturation.
+"""Amplifier models without memory: linear, hard clip, soft saturation.
 
 The rated power of a controller (a mean square) and the amplitude limit of an amplifier are separate parameters.
 ``sqrt(2 rated_power)`` relates them for a sine only; Gaussian noise at its rated power exceeds that limit 15.7 % of
@@ -131,12 +131,15 @@ def _each(amplifier: Any, n_loudspeakers: int) -> list[Any]:
 
 
 def amplifier_of_each(amplifier: Any, n_loudspeakers: int, of: str = "sample") -> list[Any]:
-    """Return for each loudspeaker a function that stands for its amplifier, or None, from one for all or one for each."""
+    """Return for each loudspeaker a function that stands for its amplifier, or None, from one for all or one for each.
+
+    One with memory is a copy at rest: no other loudspeaker and no other run has a part in what it remembers.
+    """
     each = _each(amplifier, n_loudspeakers)
     if len(each) != n_loudspeakers or not all(one is None or callable(one) for one in each):
         for_each = f", or one for each of the {n_loudspeakers} loudspeakers" if n_loudspeakers > 1 else ""
         raise TypeError(f"amplifier must be a function of a {of}{for_each}, or None, got {amplifier!r}")
-    return each
+    return [one.at_rest() if hasattr(one, "at_rest") else one for one in each]
 
 
 def amplifier_models(amplifier: Amplifier | Sequence[Amplifier | None] | None, n_loudspeakers: int) -> np.ndarray:

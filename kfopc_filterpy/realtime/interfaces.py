@@ -8,13 +8,13 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.signal import lfilter
 
-from .._types import PathModels, Seed
+from .._types import ChangingPaths, Seed
 from .._validate import as_channels, as_choice, as_count, as_positive
-from ..controllers.channel_samples import amplifier_functions
 from ..loop.inputs import SensorNoise, channel_disturbances
+from ..loop.schedule import Schedule, path_schedule, steps
 from ..paths.path_matrix import is_path_matrix, path_matrix, secondary_paths
+from ..power.amplifiers import Amplifiers, amplifier_of_each
 
 
 class Block(NamedTuple):
@@ -74,6 +74,8 @@ class Interface(Protocol):
 class SimulatedInterface:
     """A plant model that behaves like a sound card: blocks, and a delay between writing and playing.
 
+    Paths may change during the run, as in `simulate`: give pairs (time in s, path).
+
     Parameters
     ----------
     reference : array_like, shape (n_samples,) or (I, n_samples)
@@ -94,6 +96,8 @@ class SimulatedInterface:
         Amplifier model or function of a sample, or a sequence with one for each loudspeaker; by default linear.
     feedback_path : array_like or control.TransferFunction, optional
         Acoustic feedback from the amplifier to the reference microphone, or paths (I, J, n_taps).
+    crossfade_s : float, default 0
+        Time in s from the beginning to the end of a change of a path; 0 switches at once.
     sensor_noise_std : float, default 0
         Standard deviation of white noise at each error microphone.
     rng : int or numpy.random.Generator, optional
@@ -105,7 +109,7 @@ class SimulatedInterface:
     Attributes
     ----------
     total_secondary_path : ndarray, shape (latency + n_taps,) or (K, J, latency + n_taps)
-        Secondary path as a controller sees it, the delay of the interface included.
+        Secondary path at the beginning as a controller sees it, the delay of the interface included.
     disturbance : ndarray, shape (K, n_samples)
         Disturbance at the error microphones.
 
@@ -132,15 +136,16 @@ class SimulatedInterface:
     def __init__(
         self,
         reference: ArrayLike,
-        secondary_path: PathModels,
+        secondary_path: ChangingPaths,
         *,
-        primary_path: PathModels | None = None,
+        primary_path: ChangingPaths | None = None,
         disturbance: ArrayLike | None = None,
         fs: float = 16000.0,
         block: int = 64,
         latency: int | None = None,
-        amplifier: Callable[..., Any] | Sequence[Callable[..., Any]] | None = None,
-        feedback_path: PathModels | None = None,
+        amplifier: Amplifiers = None,
+        feedback_path: ChangingPaths | None = None,
+        crossfade_s: float = 0.0,
         sensor_noise_std: float = 0.0,
         rng: Seed | None = None,
         clock: str = "free",
@@ -153,29 +158,38 @@ class SimulatedInterface:
         self.clock = as_choice(clock, "clock", ("free", "real"))
         self._sensor_noise = SensorNoise(sensor_noise_std, rng)
         self._x = np.atleast_2d(as_channels(reference, "reference"))
-        secondary, _ = secondary_paths(secondary_path, fs=self.fs)
-        self.n_microphones, self.n_loudspeakers, _ = secondary.shape
         self.n_references = len(self._x)
-        zeros = np.zeros((*secondary.shape[:2], self.latency))
-        total = np.concatenate((zeros, secondary), axis=2)
-        self.total_secondary_path = total if is_path_matrix(secondary_path) else total[0, 0]
+
+        def schedule(paths: Any, name: str, read: Callable[[Any], np.ndarray]) -> Schedule:
+            return path_schedule(paths, name, read, self.n_samples, self.fs, crossfade_s)
+
+        secondary = schedule(secondary_path, "secondary_path", lambda paths: secondary_paths(paths, fs=self.fs)[0])
+        self.n_microphones, self.n_loudspeakers, _ = secondary.values[0].shape
+        total = np.pad(secondary.values[0], ((0, 0), (0, 0), (self.latency, 0)))
+        several = any(is_path_matrix(path) for _, path in steps(secondary_path, "secondary_path"))
+        self.total_secondary_path = total if several else total[0, 0]
         if (primary_path is None) == (disturbance is None):
             raise ValueError("give exactly one of primary_path= and disturbance=")
-        self.disturbance = channel_disturbances(self._x, primary_path, disturbance, self.fs, self.n_microphones)
-        self._amplifiers = amplifier_functions(amplifier, self.n_loudspeakers)
+        self.disturbance = channel_disturbances(
+            self._x, primary_path, disturbance, self.fs, self.n_microphones, crossfade_s
+        )
+        self._amplifiers = amplifier_of_each(amplifier, self.n_loudspeakers)
         self._secondary = _Paths(secondary)
         self._feedback = None
         if feedback_path is not None:
-            feedback, _ = path_matrix(feedback_path, fs=self.fs, name="feedback_path")
-            if feedback.shape[:2] != (self.n_references, self.n_loudspeakers):
-                raise ValueError(
-                    f"feedback_path must lead from the {self.n_loudspeakers} loudspeakers to the {self.n_references} "
-                    f"references, got paths {feedback.shape}"
-                )
-            self._feedback = _Paths(feedback)
+            self._feedback = _Paths(schedule(feedback_path, "feedback_path", self._read_feedback))
         self._queue = np.zeros((self.n_loudspeakers, self.latency))  # written, not yet played
         self._done, self._began = 0, 0.0
         self.blocks_can_repeat = False  # simulated noise may be exactly periodic
+
+    def _read_feedback(self, paths: Any) -> np.ndarray:
+        feedback, _ = path_matrix(paths, fs=self.fs, name="feedback_path")
+        if feedback.shape[:2] != (self.n_references, self.n_loudspeakers):
+            raise ValueError(
+                f"feedback_path must lead from the {self.n_loudspeakers} loudspeakers to the {self.n_references} "
+                f"references, got paths {feedback.shape}"
+            )
+        return feedback
 
     @property
     def n_samples(self) -> int:
@@ -205,8 +219,8 @@ class SimulatedInterface:
         if now.stop > self.n_samples:
             return None
         y = self._queue[:, : self.block]
-        if self._amplifiers is not None:
-            y = np.array([amplifier(signal) for amplifier, signal in zip(self._amplifiers, y, strict=True)])
+        each = zip(self._amplifiers, y, strict=True)
+        y = np.array([signal if amplifier is None else amplifier(signal) for amplifier, signal in each])
         e = self.disturbance[:, now] - self._secondary(y)
         e += self._sensor_noise.take(*e.shape)
         x = self._x[:, now] + (0.0 if self._feedback is None else self._feedback(y))
@@ -225,17 +239,22 @@ class SimulatedInterface:
 
 
 class _Paths:
-    """Paths (outputs, inputs, taps), through which signals pass block by block."""
+    """Paths (outputs, inputs, taps) that may change, through which signals pass block by block."""
 
-    def __init__(self, taps: np.ndarray) -> None:
-        self._taps = taps
-        self._states = np.zeros((*taps.shape[:2], taps.shape[2] - 1))
+    def __init__(self, schedule: Schedule) -> None:
+        self._schedule, self._done = schedule, 0
+        _, n_inputs, n_taps = schedule.values[0].shape
+        self._line = np.zeros((n_inputs, n_taps - 1))
 
     def __call__(self, signals: np.ndarray) -> np.ndarray:
         """Return the outputs, (outputs, n), of the next block, (inputs, n)."""
-        outputs = np.zeros((len(self._taps), signals.shape[1]))
-        for k, row in enumerate(self._taps):
-            for j, taps in enumerate(row):
-                y, self._states[k, j] = lfilter(taps, [1.0], signals[j], zi=self._states[k, j])
-                outputs[k] += y
-        return outputs
+        heard = np.concatenate((self._line, signals), axis=1)
+        rows = np.lib.stride_tricks.sliding_window_view(heard, self._line.shape[1] + 1, axis=1)[..., ::-1]
+        parts, begin, n = [], 0, signals.shape[1]
+        while begin < n:
+            taps, until = self._schedule.at(self._done + begin)
+            end = min(until - self._done, n)
+            parts.append(np.tensordot(taps, rows[:, begin:end], axes=((1, 2), (0, 2))))
+            begin = end
+        self._line, self._done = heard[:, n:], self._done + n
+        return np.concatenate(parts, axis=1)
