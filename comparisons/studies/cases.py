@@ -14,9 +14,11 @@ from kfopc_filterpy import (
     bandpass_path,
     power_constrained_wiener,
 )
+from kfopc_filterpy._types import ChangingPaths
 from kfopc_filterpy.bench import Runs, Scene, Tuned, algorithms, best_setting, make_controller, make_scene, try_settings
 from kfopc_filterpy.bench.scene import louder, reachable_weights
 from kfopc_filterpy.bounds import PowerConstrainedWiener
+from kfopc_filterpy.loop.inputs import disturbance_at_microphone, noise_gain
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.signals import (
     DataUnavailableError,
@@ -24,7 +26,6 @@ from kfopc_filterpy.signals import (
     band_limited_noise,
     bursty_noise,
     compressor_noise,
-    level_jump,
     load_measured_duct,
     looped,
     swelling,
@@ -139,11 +140,6 @@ def measured_data() -> MeasuredDuct | None:
         return None
 
 
-def with_jump(noise: np.ndarray, gain_db: float, begin_s: float, end_s: float) -> np.ndarray:
-    """Return the noise, louder or softer between two times."""
-    return level_jump(level_jump(noise, begin_s, gain_db, fs=FS), end_s, -gain_db, fs=FS)
-
-
 # ---- Scenes
 
 
@@ -178,6 +174,12 @@ def noise_of(name: str, duration_s: float, seed: int = SEED) -> np.ndarray:
 def driven_case(pair: Pair, noise: np.ndarray, overdrive_db: float) -> Scene:
     """Return the scene of a noise whose unconstrained control power, 1, is so many dB above the rated one."""
     return with_overdrive(make_case(pair, noise, n_taps=N_TAPS), overdrive_db)
+
+
+def changing(scene: Scene, primary: ChangingPaths, *, noise_level_db: Any = 0.0) -> Scene:
+    """Return a scene of one seed whose primary path and noise change as `simulate` has it."""
+    x = scene.references[0] * noise_gain(noise_level_db, scene.references[0].size, FS)
+    return replace(scene, references=[x], disturbances=[disturbance_at_microphone(x, primary, None, FS)])
 
 
 def with_overdrive(scene: Scene, overdrive_db: float) -> Scene:

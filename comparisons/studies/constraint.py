@@ -180,8 +180,8 @@ def run_amplifiers(scene: Scene, primary: np.ndarray, case: Case, tuned: Setting
         for words, amplifier in known.items()
     ]
     wrong = replace(scene, secondary=path_taps(perturbed_path(scene.secondary, fs=FS, gain_db=6.0, phase_deg=45.0)))
-    x = cases.with_jump(scene.references[0], JUMP_DB, *JUMP_S)
-    jumping = replace(clipping, references=[x], disturbances=[np.convolve(x, primary)[: x.size]])
+    begin_s, end_s = JUMP_S
+    jumping = cases.changing(clipping, primary, noise_level_db=[(0.0, 0.0), (begin_s, JUMP_DB), (end_s, 0.0)])
     for name in LIMITED:
         jobs.append((clipping, name, "path 6 dB, 45° off", _controller(wrong, name, tuned)))
         jobs.append((jumping, name, f"{JUMP_DB:g} dB louder for a second", _controller(scene, name, tuned)))

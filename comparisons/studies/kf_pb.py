@@ -178,18 +178,14 @@ def run_with_jump(
     case: Rated, estimate: np.ndarray, later: np.ndarray, disturbance: np.ndarray
 ) -> tuple[np.ndarray, int]:
     """Return the error and the alarms of a run whose secondary path and disturbance become others at `JUMP_S`."""
-    controller = case.kf_pb(estimate)
-    on, jump = round(cases.SILENT_S * FS), round((cases.SILENT_S + JUMP_S) * FS)
-    controller.listen(case.reference[:on], case.disturbance[:on])
-    line = np.zeros(case.secondary.size)
-    errors = np.empty(case.reference.size - on)
-    for n in range(on, case.reference.size):
-        path, d = (case.secondary, case.disturbance[n]) if n < jump else (later, disturbance[n])
-        line[1:] = line[:-1]
-        line[0] = controller.control_signal(case.reference[n])
-        errors[n - on] = d - path @ line
-        controller.update(errors[n - on])
-    return errors, controller.alarms
+    controller, jump_s = case.kf_pb(estimate), cases.SILENT_S + JUMP_S
+    at = round(jump_s * FS)
+    result = case.run(
+        controller,
+        secondary_path=[(0.0, case.secondary), (jump_s, later)],
+        disturbance=np.concatenate([case.disturbance[:at], disturbance[at:]]),
+    )
+    return result.error, controller.alarms
 
 
 # ---- Findings, tables, figure

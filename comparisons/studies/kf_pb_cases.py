@@ -13,9 +13,9 @@ from scipy.signal import fftconvolve
 from kfopc_filterpy import kf_pb, noise_reduction_db, power_constrained_wiener, simulate
 from kfopc_filterpy.bench.scene import reachable_weights
 from kfopc_filterpy.paths import path_taps, perturbed_path
-from kfopc_filterpy.signals import DataUnavailableError, load_measured_duct, load_measured_room, looped
+from kfopc_filterpy.signals import DataUnavailableError, level_jump, load_measured_duct, load_measured_room, looped
 
-from .cases import FS, SENSOR_NOISE_DB, Pair, made_noises, paths, with_jump
+from .cases import FS, SENSOR_NOISE_DB, Pair, made_noises, paths
 
 N_TAPS = 256
 SILENT_S, DURATION_S = 3.0, 20.0  # before and after the control is switched on
@@ -70,7 +70,8 @@ def recordings() -> dict[str, np.ndarray]:
 
 def jumping(make: Make, gain_db: float, begin_s: float, end_s: float) -> np.ndarray:
     """Return a noise that is louder between two times after switch-on."""
-    return with_jump(make(), gain_db, SILENT_S + begin_s, SILENT_S + end_s - 1 / FS)
+    louder = level_jump(make(), SILENT_S + begin_s, gain_db, fs=FS)
+    return level_jump(louder, SILENT_S + end_s - 1 / FS, -gain_db, fs=FS)
 
 
 def mixed(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -107,10 +108,10 @@ class Rated:
         """Return KF-PB with an estimate of the secondary path."""
         return kf_pb(N_TAPS, estimate, rated_power=self.rated_power, fs=FS, **options)
 
-    def run(self, controller: Any) -> Any:
-        """Return the run of a controller."""
+    def run(self, controller: Any, **changed: Any) -> Any:
+        """Return the run of a controller; `changed` is what another plant has in place of the case's."""
         plant: dict[str, Any] = {"disturbance": self.disturbance, "secondary_path": self.secondary, "fs": FS}
-        return simulate(controller, self.reference, **plant, switch_on_s=SILENT_S)
+        return simulate(controller, self.reference, **plant | changed, switch_on_s=SILENT_S)
 
     def reduction_db(self, error: np.ndarray, begin_s: float = 1.0, end_s: float | None = None) -> float:
         """Return the noise reduction between two times after switch-on, up to the end if only one is given."""

@@ -10,7 +10,7 @@ import numpy as np
 from kfopc_filterpy.bench import Scene
 from kfopc_filterpy.paths import Duct, duct_paths, path_taps
 
-from .cases import FS, SEED, SWITCH_ON_S, Pair, driven_case, noise_of, with_jump
+from .cases import FS, SEED, SWITCH_ON_S, Pair, changing, driven_case, noise_of
 
 OVERDRIVE_DB = 3.0
 LOUDER, SOFTER = "20 dB louder", "20 dB softer"
@@ -74,17 +74,14 @@ def scenes_of(event: Event, pair: Pair) -> list[Scene]:
 def jump_scene(pair: Pair, seed: int, gain_db: float) -> Scene:
     """Return band noise that is louder or softer for a while; the rated power is that of its usual level."""
     scene = driven_case(pair, noise_of("band noise", JUMP_RUN_S, seed), OVERDRIVE_DB)
-    x = with_jump(scene.references[0], gain_db, *(t + SWITCH_ON_S for t in JUMP_S))
-    return replace(scene, references=[x], disturbances=[np.convolve(x, pair[0])[: x.size]])
+    begin, end = (t + SWITCH_ON_S for t in JUMP_S)
+    return changing(scene, pair[0], noise_level_db=[(0.0, 0.0), (begin, gain_db), (end, 0.0)])
 
 
 def change_scene(pair: Pair, seed: int, other: np.ndarray) -> Scene:
     """Return band noise whose primary path changes at `CHANGE_S`: what is on its way then arrives by the new one."""
     scene = driven_case(pair, noise_of("band noise", CHANGE_RUN_S, seed), OVERDRIVE_DB)
-    x, d = scene.references[0], scene.disturbances[0].copy()
-    at = round((CHANGE_S + SWITCH_ON_S) * FS)
-    d[at:] = np.convolve(x, other)[at : x.size]
-    return replace(scene, disturbances=[d])
+    return changing(scene, [(0.0, pair[0]), (CHANGE_S + SWITCH_ON_S, other)])
 
 
 def sweep_scene(pair: Pair, sweeps: int) -> Scene:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._types import ChangingPaths, PerLoudspeaker, Seed
-from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_loudspeaker
+from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
 from ..controllers.base import Controller, Looped, checked_controller, differing_counts, listening
 from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
@@ -26,6 +26,7 @@ from .inputs import (
     channel_disturbances,
     disturbance_at_microphone,
     naming_sample,
+    noise_gain,
     switch_on_sample,
 )
 from .result import SimulationResult
@@ -371,7 +372,12 @@ def _read_signals(
 ) -> tuple[np.ndarray, np.ndarray, Schedule]:
     """Return references (I, n), disturbances (K, n) and secondary paths (K, J, taps)."""
     x = np.atleast_2d(as_channels(reference, "reference") if several else as_signal(reference, "reference"))
-    x = x * _gain(noise_level_db, x.shape[1], fs, crossfade_s, disturbance)
+    if disturbance is not None and noise_level_db != 0.0:
+        raise ValueError(
+            "noise_level_db needs primary_path=, by which the disturbance follows; if you give the disturbance, scale "
+            "both signals yourself, with signals.level_jump for example"
+        )
+    x = x * noise_gain(noise_level_db, x.shape[1], fs, crossfade_s)
 
     def read(paths: Any) -> np.ndarray:
         if several:
@@ -383,24 +389,6 @@ def _read_signals(
         K = len(secondary.values[0])
         return x, channel_disturbances(x, primary_path, disturbance, fs, K, crossfade_s), secondary
     return x, disturbance_at_microphone(x[0], primary_path, disturbance, fs, crossfade_s)[None], secondary
-
-
-def _gain(noise_level_db: Any, n_samples: int, fs: float, crossfade_s: float, disturbance: Any) -> np.ndarray:
-    """Return the gain of the noise in each sample."""
-
-    def read(level_db: Any) -> float:
-        level = as_number(level_db, "noise_level_db", unit="dB")
-        if level and disturbance is not None:
-            raise ValueError(
-                "noise_level_db needs primary_path=, by which the disturbance follows; if you give the disturbance, "
-                "scale both signals yourself, with signals.level_jump for example"
-            )
-        return float(10 ** (level / 20))
-
-    pairs, gain = steps(noise_level_db, "noise_level_db", of_numbers=True), np.zeros(n_samples)
-    for value, part, share in as_schedule(pairs, "noise_level_db", read, n_samples, fs, crossfade_s).parts(n_samples):
-        gain[part] += share * value
-    return gain
 
 
 def _feedback(

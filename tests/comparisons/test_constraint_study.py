@@ -345,13 +345,6 @@ def test_louder_scales_signals_powers_and_q_but_no_weights(scenes: Any) -> None:
     assert unconstrained_power(loud) == pytest.approx(16.0 * unconstrained_power(scene), rel=1e-9)
 
 
-def test_a_jump_is_between_its_times() -> None:
-    noise = np.ones(16000)
-    jumped = cases.with_jump(noise, -20.0, 0.25, 0.5)
-    np.testing.assert_array_equal(noise, 1.0)
-    np.testing.assert_allclose(jumped, np.where((np.arange(16000) // 4000) == 1, 0.1, 1.0), rtol=1e-15)
-
-
 def test_measured_data_join_where_they_are_at_hand(shared_data: Any, data_folder: Any) -> None:
     data_folder(shared_data)
     cases.measured_data.cache_clear()
