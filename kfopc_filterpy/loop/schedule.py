@@ -86,14 +86,14 @@ def as_schedule(
         raise ValueError(
             f"{name} must have times that rise, by a sample at least, within the run of {n_samples / fs:g} s, got {times}"
         )
-    fade = as_nonnegative(crossfade_s, "crossfade_s", unit="s") * fs
-    longest = min(gaps[1:], default=n_samples)
-    if len(pairs) > 1 and fade > longest:
+    fade = round(min(as_nonnegative(crossfade_s, "crossfade_s", unit="s") * fs, n_samples + 2))
+    longest = min(gaps[1:].tolist(), default=n_samples)
+    if len(pairs) > 1 and fade > longest + 1:  # two times in s that are rounded may be a sample nearer
         raise ValueError(
             f"crossfade_s must be at most {longest / fs:g} s, the shortest time between two changes of {name} or the "
             f"length of the run, got {crossfade_s:g} s"
         )
-    return Schedule(begins, [read(value) for _, value in pairs], round(min(fade, longest)))
+    return Schedule(begins, [read(value) for _, value in pairs], min(fade, longest))
 
 
 def path_schedule(

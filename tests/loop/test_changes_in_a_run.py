@@ -10,12 +10,14 @@ from helpers.comparing import assert_same_run
 from helpers.simulation import MAKERS, D, Integrator, S, X, constraint
 
 from kfopc_filterpy import HardClipAmplifier, LinearAmplifier, simulate, simulate_scenarios
+from kfopc_filterpy.realtime import SimulatedInterface
 
 FS, N = 1000.0, X.size  # so a time of 0.1 is the sample 100
 RNG = np.random.default_rng(3)
 SECONDARY = [(0.0, S), (0.05, -0.5 * RNG.standard_normal(7)), (0.2, S[:2])]
 PRIMARY = [(0.0, RNG.standard_normal(9)), (0.1, RNG.standard_normal(4))]
 FEEDBACK = [(0.0, None), (0.12, np.array([0.0, 0.3])), (0.25, np.array([0.0, 0.0, 0.0, -0.3]))]
+SILENT_FIRST = [(0.0, np.zeros(1)), *FEEDBACK[1:]]  # the same
 AMPLIFIER = [(0.0, None), (0.15, HardClipAmplifier(0.2)), (0.25, LinearAmplifier())]
 CHANGES: dict[str, Any] = {"secondary_path": SECONDARY, "primary_path": PRIMARY, "fs": FS}
 ALL = CHANGES | {"feedback_path": FEEDBACK, "amplifier": AMPLIFIER}
@@ -63,8 +65,7 @@ def test_everything_changes_as_in_plain_numpy(fade: int) -> None:
     np.testing.assert_allclose(run.disturbance, single(PRIMARY, fade, X), rtol=0, atol=1e-13)
     np.testing.assert_allclose(run.anti_noise, single(SECONDARY, fade, run.amplifier_output), rtol=0, atol=1e-13)
     np.testing.assert_array_equal(run.error, run.disturbance - run.anti_noise)
-    paths = [(time, [0.0] if path is None else path) for time, path in FEEDBACK]
-    heard = X + single(paths, fade, run.amplifier_output)
+    heard = X + single(SILENT_FIRST, fade, run.amplifier_output)
     np.testing.assert_allclose(run.control_signal, 0.5 * heard, rtol=0, atol=1e-13)
     y, n = run.control_signal, np.arange(N)
     np.testing.assert_array_equal(run.amplifier_output, np.where((n < 150) | (n >= 250), y, np.clip(y, -0.2, 0.2)))
@@ -131,6 +132,31 @@ def test_scenarios_may_have_a_primary_path_that_changes() -> None:
     np.testing.assert_array_equal(run.error, simulate(MAKERS["KF-ANC"](), X, **plant).error)
 
 
+@pytest.mark.parametrize("fade", [0, 20])
+def test_a_simulated_interface_changes_too(fade: int) -> None:
+    """The blocks end between two changes, and in the midst of a cross-fade."""
+    plant = SimulatedInterface(
+        X,
+        SECONDARY,
+        primary_path=PRIMARY,
+        feedback_path=SILENT_FIRST,
+        fs=FS,
+        block=12,
+        latency=24,
+        crossfade_s=fade / FS,
+    )
+    y = np.random.default_rng(5).standard_normal(N)
+    blocks = []
+    while (block := plant.read()) is not None:
+        plant.write(y[np.newaxis, 12 * len(blocks) : 12 * len(blocks) + 12])
+        blocks.append(block)
+    played = np.concatenate((np.zeros(24), y[:-24]))
+    found = [np.concatenate([getattr(block, name)[0] for block in blocks]) for name in ("references", "errors")]
+    np.testing.assert_allclose(found[0], X + single(SILENT_FIRST, fade, played), rtol=0, atol=1e-13)
+    expected = single(PRIMARY, fade, X) - single(SECONDARY, fade, played)
+    np.testing.assert_allclose(found[1], expected, rtol=0, atol=1e-13)
+
+
 REFUSED = [
     (
         {"secondary_path": [(0.1, S), (0.2, S)]},
@@ -149,7 +175,7 @@ REFUSED = [
     ({"feedback_path": [(0.0, None), (0.1, [1.0, 1.0])]}, "feedback_path must have a delay"),
     ({"amplifier": [(0.0, None), (0.4, np.tanh)]}, "amplifier must have times that rise, .* within the run"),
     ({"amplifier": [(0.0, None), (0.1, "loud")]}, "amplifier must be a function of a sample"),
-    ({"crossfade_s": 0.16, "secondary_path": SECONDARY}, "crossfade_s must be at most 0.15 s, the shortest time"),
+    ({"crossfade_s": 0.152, "secondary_path": SECONDARY}, "crossfade_s must be at most 0.15 s, the shortest time"),
     ({"crossfade_s": 1e308, "primary_path": PRIMARY}, "crossfade_s must be at most 0.3 s, .* length of the run"),
     ({"crossfade_s": -1.0}, "crossfade_s must not be negative"),
     ({"noise_level_db": [(0.0, 0.0), (0.1, np.inf)]}, "noise_level_db must be finite"),
