@@ -14,21 +14,26 @@ from .._types import ChangingPaths, Seed
 from .._validate import as_channels, as_generator, as_nonnegative, as_number, as_signal
 from ..paths.models import path_taps
 from ..paths.path_matrix import primary_paths
-from .schedule import as_schedule, path_schedule, steps
+from .schedule import as_schedule, path_schedule
 
+LARGEST_GAIN_DB = 400.0  # 1e20 is the largest sample that controllers learn from
 DIVERGENCE_LIMIT = 1e6  # a run stops if the control signal exceeds this multiple of sqrt(rated power)
 
 
 def noise_gain(level_db: Any, n_samples: int, fs: float, crossfade_s: float = 0.0) -> np.ndarray:
     """Return the gain of a noise in each sample, from a level in dB that may change."""
 
-    def read(level: Any) -> float:
-        return float(10 ** (as_number(level, "noise_level_db", unit="dB") / 20))
+    def read(value: Any) -> float:
+        level = as_number(value, "noise_level_db", unit="dB")
+        if abs(level) > LARGEST_GAIN_DB:
+            raise ValueError(f"noise_level_db must be within {LARGEST_GAIN_DB:g} dB of 0 dB, got {level:g} dB")
+        return float(10 ** (level / 20))
 
-    pairs, gain = steps(level_db, "noise_level_db", of_numbers=True), np.zeros(n_samples)
-    for value, part, share in as_schedule(pairs, "noise_level_db", read, n_samples, fs, crossfade_s).parts(n_samples):
-        gain[part] += share * value
-    return gain
+    gains = as_schedule(level_db, "noise_level_db", read, n_samples, fs, crossfade_s, of_numbers=True)
+    total = np.zeros(n_samples)
+    for gain, part, share in gains.parts(n_samples):
+        total[part] += share * gain
+    return total
 
 
 def disturbance_at_microphone(

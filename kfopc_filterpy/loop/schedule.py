@@ -59,7 +59,7 @@ def steps(value: Any, name: str, *, of_numbers: bool = False) -> list[Any]:
     entries = value if isinstance(value, list | tuple) else ()
     pairs = [isinstance(entry, list | tuple) and len(entry) == 2 for entry in entries]
     if not any(
-        pair and isinstance(entry[0], Real) and (of_numbers or not isinstance(entry[1], Real))
+        pair and (of_numbers or isinstance(entry[0], Real) != isinstance(entry[1], Real))
         for pair, entry in zip(pairs, entries, strict=True)
     ):
         return [(0.0, value)]
@@ -69,14 +69,17 @@ def steps(value: Any, name: str, *, of_numbers: bool = False) -> list[Any]:
 
 
 def as_schedule(
-    pairs: list[Any],
+    value: Any,
     name: str,
     read: Callable[[Any], Any],
     n_samples: int,
     fs: float,
     crossfade_s: float = 0.0,
+    *,
+    of_numbers: bool = False,
 ) -> Schedule:
-    """Return the schedule of pairs (time in s, value) in a run; `read` checks and converts a value."""
+    """Return the schedule of what stays in a run, or of pairs (time in s, value); `read` checks and converts a value."""
+    pairs = steps(value, name, of_numbers=of_numbers)
     times = [as_number(time, f"a time of {name}", unit="s") for time, _ in pairs]
     begins = [round(min(max(time * fs, -1.0), n_samples)) for time in times]
     if begins[0] != 0:
@@ -100,7 +103,7 @@ def path_schedule(
     paths: Any, name: str, read: Callable[[Any], np.ndarray], n_samples: int, fs: float, crossfade_s: float = 0.0
 ) -> Schedule:
     """Return the schedule of a path, or of paths; the taps of all are filled with zeros to the longest."""
-    schedule = as_schedule(steps(paths, name), name, read, n_samples, fs, crossfade_s)
+    schedule = as_schedule(paths, name, read, n_samples, fs, crossfade_s)
     if len({taps.shape[:-1] for taps in schedule.values}) > 1:
         shapes = " and ".join(str(taps.shape) for taps in schedule.values)
         raise ValueError(f"{name} must have the same numbers of channels at all times, got taps {shapes}")

@@ -176,7 +176,7 @@ def simulate(
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = switch_on_sample(switch_on_s, fs, x.shape[1])
     n_samples = x.shape[1]
-    amplifiers = as_schedule(steps(amplifier, "amplifier"), "amplifier", lambda one: _amplifiers(one, J), n_samples, fs)
+    amplifiers = as_schedule(amplifier, "amplifier", lambda one: _amplifiers(one, J), n_samples, fs)
     feedback = _feedback(feedback_path, fs, len(x), J, several, n_samples, crossfade_s)
     if hasattr(controller, "require_sample_rate"):
         controller.require_sample_rate(fs)

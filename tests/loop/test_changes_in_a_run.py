@@ -168,6 +168,7 @@ REFUSED = [
     ({"secondary_path": [(0.0, S), (1e308, S)]}, "within the run of 0.3 s"),
     ({"secondary_path": [(-1e308, S), (0.1, S)]}, "must begin with a value for the time 0 s"),
     ({"secondary_path": [(np.nan, S), (0.1, S)]}, "a time of secondary_path must be finite"),
+    ({"secondary_path": [(S, 0.0), (S, 0.1)]}, "a time of secondary_path must be a single number in s"),
     ({"secondary_path": [(0.0, S), S]}, r"secondary_path must be one value, or a list of pairs \(time in s, value\)"),
     ({"secondary_path": [(0.0, S), (0.1, [np.nan])]}, "secondary_path must be finite"),
     ({"secondary_path": [(0.0, [[S]]), (0.1, [[S], [S]])]}, r"same numbers of channels .* \(1, 1, 3\) and \(2, 1, 3\)"),
@@ -179,6 +180,7 @@ REFUSED = [
     ({"crossfade_s": 1e308, "primary_path": PRIMARY}, "crossfade_s must be at most 0.3 s, .* length of the run"),
     ({"crossfade_s": -1.0}, "crossfade_s must not be negative"),
     ({"noise_level_db": [(0.0, 0.0), (0.1, np.inf)]}, "noise_level_db must be finite"),
+    ({"noise_level_db": 1e300}, "noise_level_db must be within 400 dB of 0 dB"),
     ({"noise_level_db": 6.0, "primary_path": None, "disturbance": D}, "noise_level_db needs primary_path="),
 ]
 
