@@ -436,9 +436,7 @@ def harmonics_db(
     centres = np.round(np.arange(2, 11) * bins_per_harmonic).astype(int)
     centres = centres[centres + _LOBE_BINS <= (n_samples - 1) // 2]
     if centres.size == 0:
-        raise ValueError(
-            f"fundamental_hz must leave its second harmonic below fs/2 = {rate / 2:g} Hz, got {fundamental_hz:g} Hz"
-        )
+        raise ValueError(f"fundamental_hz must have a second harmonic below {rate / 2:g} Hz, got {fundamental_hz:g} Hz")
     harmonics = np.sum(_line_powers(e, centres))
     fundamental = _line_powers(d, np.array([round(bins_per_harmonic)]))[0]
     return float(_ratio_db(harmonics, fundamental))
@@ -517,9 +515,7 @@ def coherence_and_gain(
     frequencies = np.fft.rfftfreq(segment, 1 / fs)
     inside = (frequencies >= low) & (frequencies <= high)
     if not np.any(inside):
-        raise ValueError(
-            f"band {low:g} to {high:g} Hz holds no frequency bin, {fs / segment:g} Hz apart; raise segment_s"
-        )
+        raise ValueError(f"band {low:g} to {high:g} Hz holds no frequency bin of {fs / segment:g} Hz; raise segment_s")
 
     def cross(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return csd(x, y, fs, nperseg=segment, detrend=False)[1].mean(axis=0)[..., inside]
@@ -744,11 +740,9 @@ def _as_runs(value: Any, name: str, runs: bool) -> np.ndarray:
     """
     array = as_real_array(value, name)
     if array.ndim - bool(runs) not in (1, 2):
-        expected = (
-            "with runs=True (n_runs, n_samples) or (n_runs, n_channels, n_samples)"
-            if runs
-            else "(n_samples,) or (n_channels, n_samples)"
-        )
+        expected = "(n_samples,) or (n_channels, n_samples)"
+        if runs:
+            expected = "with runs=True (n_runs, n_samples) or (n_runs, n_channels, n_samples)"
         hint = "" if runs or array.ndim < 3 else "; pass runs=True if the leading axis counts runs"
         raise ValueError(f"{name} must be {expected}, got shape {array.shape}{hint}")
     if array.size == 0:

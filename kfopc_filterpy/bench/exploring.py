@@ -74,9 +74,7 @@ class AcousticSetup:
             return
         noise = as_signal(self.noise, "noise")
         if noise.size < SHORTEST_S * fs:
-            raise ValueError(
-                f"noise must last {SHORTEST_S:g} s at least, got {noise.size / fs:.3g} s: take a longer recording"
-            )
+            raise ValueError(f"noise must last {SHORTEST_S:g} s at least, got {noise.size / fs:.3g} s: record longer")
         if not np.any(noise[: int(DURATION_S * fs)]):
             raise ValueError(f"noise is silent in its first {DURATION_S:g} s: cut the silence off, or record it again")
         object.__setattr__(self, "noise", noise[: int(DURATION_S * fs)])

@@ -101,9 +101,7 @@ class Table:
         _require_stem(self.stem, "stem")
         for row in self.rows:
             if len(row) != len(self.headings):
-                raise ValueError(
-                    f"rows must have {len(self.headings)} cells, one for each heading, got {len(row)}: {row}"
-                )
+                raise ValueError(f"rows must have {len(self.headings)} cells, as there are headings, got {row}")
 
     @property
     def cells(self) -> list[list[str]]:

@@ -164,7 +164,7 @@ def channel_record(
     n_taps = as_count(n_taps, "n_taps")
     if d.shape != (len(secondary), x.shape[1]):
         raise ValueError(
-            f"disturbance must be (K microphones, n_samples) = {(len(secondary), x.shape[1])}, got {d.shape}"
+            f"disturbance must be (K microphones, n_samples) = {len(secondary), x.shape[1]}, got {d.shape}"
         )
     filtered = fftconvolve(x[np.newaxis, np.newaxis], secondary[:, :, np.newaxis], axes=-1)[..., : x.shape[1]]
     past = [(0, 0), (n_taps - 1, 0)]

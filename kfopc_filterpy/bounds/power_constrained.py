@@ -69,6 +69,11 @@ class ControlFilter(WienerSolution):
         return self.stretch.d - self.stretch.antinoise(self.weights)
 
 
+def _of_each(name: str, description: str) -> Any:
+    """Return a property: an array of a value of each segment."""
+    return property(lambda own: np.array([getattr(segment, name) for segment in own.segments]), doc=description)
+
+
 @dataclass(frozen=True)
 class ControlFilters:
     """A control filter for each segment of a record.
@@ -81,35 +86,14 @@ class ControlFilters:
 
     segments: tuple[ControlFilter, ...]
 
-    @property
-    def weights(self) -> np.ndarray:
-        """Weights of each segment, shape (n_segments, n_taps)."""
-        return np.array([segment.weights for segment in self.segments])
-
-    @property
-    def penalty(self) -> np.ndarray:
-        """λ of each segment, shape (n_segments,)."""
-        return self._each("penalty")
-
-    @property
-    def control_power(self) -> np.ndarray:
-        """Mean square of y in each segment, shape (n_segments,)."""
-        return self._each("control_power")
-
-    @property
-    def error_power(self) -> np.ndarray:
-        """Mean square of e in each segment, shape (n_segments,)."""
-        return self._each("error_power")
-
-    @property
-    def segment_noise_reduction_db(self) -> np.ndarray:
-        """Noise reduction of each segment in dB, shape (n_segments,); NaN without a disturbance."""
-        return self._each("noise_reduction_db")
-
-    @property
-    def start_s(self) -> np.ndarray:
-        """Start of each segment in seconds from the first sample that counts, shape (n_segments,)."""
-        return self._each("start_s")
+    weights = _of_each("weights", "Weights of each segment, shape (n_segments, n_taps).")
+    penalty = _of_each("penalty", "λ of each segment, shape (n_segments,).")
+    control_power = _of_each("control_power", "Mean square of y in each segment, shape (n_segments,).")
+    error_power = _of_each("error_power", "Mean square of e in each segment, shape (n_segments,).")
+    segment_noise_reduction_db = _of_each(
+        "noise_reduction_db", "Noise reduction of each segment in dB, shape (n_segments,); NaN without a disturbance."
+    )
+    start_s = _of_each("start_s", "Start of each segment in s from the first sample that counts, shape (n_segments,).")
 
     @property
     def noise_reduction_db(self) -> float:
@@ -126,9 +110,6 @@ class ControlFilters:
     def error(self) -> np.ndarray:
         """Error, each segment with its own weights, shape (n_samples,)."""
         return np.concatenate([segment.error for segment in self.segments], axis=-1)
-
-    def _each(self, name: str) -> np.ndarray:
-        return np.array([getattr(segment, name) for segment in self.segments])
 
 
 @dataclass(frozen=True)

@@ -146,9 +146,7 @@ def _control_power(value: Any) -> Any:
     powers = as_real_array(value, "control_power")
     require_finite(powers, "control_power")
     if np.any(powers < 0) or not np.any(powers > 0):
-        raise ValueError(
-            f"control_power must not be negative, and at least one value must be greater than 0, got {powers}"
-        )
+        raise ValueError(f"control_power must not be negative, and at least one must be greater than 0, got {powers}")
     return powers
 
 
@@ -243,10 +241,8 @@ def budgeted_rated_power(
             f"{wanted.max():g} dB; use longer control filters, or beyond='inf' to mark such values"
         )
     found = np.array([search.powers(one) for one in wanted.ravel()])  # (n, 3, J)
-    rated, spent, penalty = np.moveaxis(found, 1, 0).reshape(3, *wanted.shape, -1)
-    if not several:
-        rated, spent, penalty = rated[..., 0], spent[..., 0], penalty[..., 0]
-    return BudgetedRatedPower(wanted, rated, spent, penalty)
+    each = np.moveaxis(found, 1, 0).reshape(3, *wanted.shape, -1)
+    return BudgetedRatedPower(wanted, *(each if several else each[..., 0]))
 
 
 class _ScaleSearch:

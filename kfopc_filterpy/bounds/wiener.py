@@ -206,10 +206,9 @@ def coherence_bound(reference: ArrayLike, disturbance: ArrayLike, fs: float, *, 
 
     fs = as_positive(fs, "fs", unit="Hz")
     segment = as_count(segment, "segment", minimum=8)
-    x, d = (
-        np.atleast_2d(as_channels(one, name)) for one, name in ((reference, "reference"), (disturbance, "disturbance"))
-    )
-    for each, name in ((x, "reference"), (d, "disturbance")):
+    named = {"reference": reference, "disturbance": disturbance}
+    x, d = (np.atleast_2d(as_channels(given, name)) for name, given in named.items())
+    for each, name in zip((x, d), named, strict=True):
         for channel in each:
             as_signal(channel, name, min_length=8 * segment, length=x.shape[1])
     frequencies, of_x = welch(x, fs, nperseg=segment)
@@ -217,16 +216,15 @@ def coherence_bound(reference: ArrayLike, disturbance: ArrayLike, fs: float, *, 
     if not np.any(of_x) or not np.any(of_d):
         raise ValueError("reference and disturbance must not be silent: their coherence is undefined")
     between = csd(x[:, np.newaxis], d, fs, nperseg=segment)[1]  # (I, K, n_frequencies)
+    floor, tiny = 1e-30, np.finfo(float).tiny
     if len(x) == 1:
-        coherent = np.sum(np.abs(between[0]) ** 2, axis=0) / np.maximum(of_x[0], np.finfo(float).tiny)
+        coherent = np.sum(np.abs(between[0]) ** 2, axis=0) / np.maximum(of_x[0], tiny)
     else:
         spectra = np.moveaxis(csd(x[:, np.newaxis], x, fs, nperseg=segment)[1], -1, 0)  # (n_frequencies, I, I)
         cross = np.moveaxis(between, -1, 0)
-        coherent = np.einsum(
-            "fik,fik->f", cross.conj(), np.linalg.pinv(spectra, rcond=1e-10, hermitian=True) @ cross
-        ).real
-    floor = 1e-30
-    remaining = np.clip(1 - coherent / np.maximum(of_d, np.finfo(float).tiny), floor, 1)
+        explained = np.linalg.pinv(spectra, rcond=1e-10, hermitian=True) @ cross
+        coherent = np.einsum("fik,fik->f", cross.conj(), explained).real
+    remaining = np.clip(1 - coherent / np.maximum(of_d, tiny), floor, 1)
     overall = max(float(np.sum(remaining * of_d) / np.sum(of_d)), floor)
     return CoherenceBound(frequencies, -10 * np.log10(remaining), float(-10 * np.log10(overall)))
 

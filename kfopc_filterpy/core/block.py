@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .library import Library, load
+from .library import Field, Library, fields_of, load
 
 ALIGNMENT = 64  # bytes; wide vectors are fastest there
 _STATE, _SETTING, _SCRATCH = range(3)
@@ -53,8 +53,7 @@ class _Plan(ctypes.Structure):
 class _Setting(ctypes.Structure):
     _fields_ = [
         ("name", ctypes.c_char_p),
-        ("least", ctypes.c_double),
-        ("most", ctypes.c_double),
+        *((name, ctypes.c_double) for name in ("least", "most")),
         ("each", ctypes.c_int),
     ]
 
@@ -65,13 +64,6 @@ class _Algorithm(ctypes.Structure):
         ("settings", ctypes.POINTER(_Setting)),
         *((name, ctypes.c_void_p) for name in ("layout", "start", "control_signal", "update", "listen")),
     ]
-
-
-VISITOR = ctypes.PYFUNCTYPE(
-    None,
-    *(ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_int, ctypes.c_size_t),
-    ctypes.POINTER(ctypes.c_int32),
-)
 
 
 class Setting(NamedTuple):
@@ -122,16 +114,12 @@ class Algorithm:
 
     def shapes(self, shape: Shape) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the fields of a block, by name."""
-        found: dict[str, tuple[int, ...]] = {}
-
-        def keep(_: Any, name: bytes, role: int, kind: int, offset: int, axes: Any) -> None:
-            found[name.decode()] = tuple(axes[i] for i in range(4))
-
         arrays = {name: np.array(getattr(shape, name), np.int32) for name in ("power_windows", "limiter_windows")}
-        plan = _plan_of(shape, arrays)
-        pointer = ctypes.c_void_p(self.pointer)
-        self.library.held.anc_describe(pointer, ctypes.byref(plan), VISITOR(keep), None)
-        return found
+        return {field.name: field.shape for field in self.fields(_plan_of(shape, arrays))}
+
+    def fields(self, plan: _Plan) -> list[Field]:
+        """Return the fields of the block of a plan."""
+        return fields_of(self.library.held.anc_describe, self.pointer, ctypes.byref(plan))
 
     def __reduce__(self) -> Any:
         return Algorithm, (self.name, self.path)
@@ -150,6 +138,10 @@ class Shape:
     power_windows: tuple[int, ...] = ()  # of every loudspeaker of every scenario
     limiter_windows: tuple[int, ...] = ()
     scenarios: int = 1
+
+    def count(self, each: str) -> int:
+        """Return the number of "loudspeakers" or "microphones", 1 for ""."""
+        return getattr(self, each) if each else 1
 
 
 def _plan_of(shape: Shape, arrays: dict[str, np.ndarray]) -> _Plan:
@@ -224,9 +216,8 @@ class Block:
         if memory is not None:
             keep["settings"] = self._settings_in(memory, keep)
         plan = _plan_of(shape, keep)
-        of = ctypes.byref
-        self._library.anc_size.restype = ctypes.c_size_t
-        size = self._library.anc_size(ctypes.c_void_p(algorithm.pointer), of(plan))
+        described = algorithm.pointer, ctypes.byref(plan)
+        size = self._library.anc_size(*described)
         if not size:
             raise ValueError(f"a controller of this size cannot be made: {shape}")
         room = np.zeros(size + ALIGNMENT, np.uint8)
@@ -237,21 +228,15 @@ class Block:
             self.memory[:] = memory
         self._view = (ctypes.c_void_p * _VIEW_PLACES)()
         self.address = ctypes.addressof(self._view)
-        opened = self._library.anc_open(
-            ctypes.c_void_p(algorithm.pointer),
-            of(plan),
-            self._view,
-            ctypes.c_void_p(self.memory.ctypes.data),
-            ctypes.c_size_t(size),
-            ctypes.c_int(memory is None),
-        )
-        if not opened:
+        if not self._library.anc_open(*described, self._view, self.memory.ctypes.data, size, memory is None):
             raise ValueError(f"a setting or a path of {algorithm.name} is out of its range: {settings}")
         self.fields: dict[str, NDArray[Any]] = {}
-        self._scratch: list[slice] = []  # their bytes
-        self.states: list[str] = []
-        self.scratch: list[str] = []
-        self._library.anc_describe(ctypes.c_void_p(algorithm.pointer), of(plan), VISITOR(self._keep_field), None)
+        names: dict[int, list[str]] = {_STATE: [], _SETTING: [], _SCRATCH: []}
+        for name, role, kind, offset, axes in algorithm.fields(plan):
+            dtype = (algorithm.precision, np.dtype(np.int32))[kind]
+            self.fields[name] = np.frombuffer(self.memory, dtype, int(np.prod(axes)), offset).reshape(axes)
+            names[role].append(name)
+        self.states, self.scratch = names[_STATE], names[_SCRATCH]
         counts = (shape.references, shape.scenarios * shape.loudspeakers, shape.scenarios * shape.microphones)
         self.reference, self.control_signal, self.error = (np.zeros(n, algorithm.precision) for n in counts)
         control, update = algorithm.steps
@@ -264,14 +249,8 @@ class Block:
     def _plan_arrays(self, path: Any, settings: Any, guard: Any) -> dict[str, np.ndarray]:
         """Return the arrays that a plan points to."""
         shape, numbers, real = self.shape, dict(settings or {}), self.algorithm.precision
-        values = (
-            [
-                np.broadcast_to(numbers.pop(name), getattr(shape, each) if each else 1)
-                for name, each in self.algorithm.settings
-            ]
-            if numbers
-            else []
-        )
+        own = self.algorithm.settings if numbers else []
+        values = [np.broadcast_to(numbers.pop(name), shape.count(each)) for name, each in own]
         if numbers:
             raise TypeError(f"{self.algorithm.name} has no setting {', '.join(numbers)}")
         return {
@@ -284,20 +263,11 @@ class Block:
 
     def _settings_in(self, memory: NDArray[np.uint8], arrays: dict[str, np.ndarray]) -> np.ndarray:
         """Return the settings of a block, on which the size of the fields after them may depend."""
-        real = self.algorithm.precision
-        found: dict[bytes, NDArray[np.uint8]] = {}
-
-        def keep(_: Any, name: bytes, role: int, kind: int, offset: int, axes: Any) -> None:
-            if role == _SETTING:
-                found[name] = memory[offset : offset + real.itemsize * axes[3]]
-
-        plan = _plan_of(self.shape, {**arrays, "settings": np.array([])})
-        self._library.anc_describe(ctypes.c_void_p(self.algorithm.pointer), ctypes.byref(plan), VISITOR(keep), None)
-        values = [found.get(name.encode(), memory[:0]) for name, _ in self.algorithm.settings]
-        expected = sum(
-            real.itemsize * (getattr(self.shape, each) if each else 1) for _, each in self.algorithm.settings
-        )
-        if sum(value.size for value in values) != expected:
+        real, own = self.algorithm.precision, self.algorithm.settings
+        fields = self.algorithm.fields(_plan_of(self.shape, {**arrays, "settings": np.array([])}))
+        ends = {field.name: (field.offset, field.offset + real.itemsize * field.shape[3]) for field in fields}
+        values = [memory[slice(*ends.get(name, (0, 0)))] for name, _ in own]
+        if sum(value.size for value in values) != real.itemsize * sum(self.shape.count(each) for _, each in own):
             raise ValueError(f"the memory of {memory.size} bytes is not that of a controller of {self.shape}")
         return np.concatenate([*(value.view(real) for value in values), np.zeros(1, real)])
 
@@ -310,28 +280,19 @@ class Block:
         if fresh:
             if self.algorithm.settings and not arrays["settings"].size:
                 raise ValueError(
-                    f"{self.algorithm.name} needs its settings {[one.name for one in self.algorithm.settings]}"
+                    f"{self.algorithm.name} needs its settings {[name for name, _ in self.algorithm.settings]}"
                 )
             sizes |= {"path": (shape.microphones * shape.loudspeakers * shape.path_taps,), "guard": (shape.guard_taps,)}
         for name, expected in sizes.items():
             if arrays[name].size not in expected:
                 raise ValueError(f"{name} of {arrays[name].size} numbers does not fit {shape}")
 
-    def _keep_field(self, _: Any, name: bytes, role: int, kind: int, offset: int, shape: Any) -> None:
-        axes, dtype = tuple(shape[i] for i in range(4)), (self.algorithm.precision, np.dtype(np.int32))[kind]
-        count = int(np.prod(axes))
-        self.fields[name.decode()] = self.memory[offset : offset + count * dtype.itemsize].view(dtype).reshape(axes)
-        if role == _STATE:
-            self.states.append(name.decode())
-        elif role == _SCRATCH:
-            self.scratch.append(name.decode())
-            self._scratch.append(slice(offset, offset + count * dtype.itemsize))
-
     def saved(self) -> NDArray[np.uint8]:
         """Return a copy of the memory, with zeros for what no next step needs: equal states have equal bytes."""
         memory = self.memory.copy()
-        for part in self._scratch:
-            memory[part] = 0
+        for field in map(self.fields.__getitem__, self.scratch):
+            begin = field.ctypes.data - self.memory.ctypes.data
+            memory[begin : begin + field.nbytes] = 0
         return memory
 
     def latest(self, name: str) -> NDArray[np.float64]:
@@ -378,15 +339,10 @@ class Block:
         Return the number of samples before a refusal, and the answer, 0 if all is well.
         """
         arrays, answer = [np.ascontiguousarray(array) for array in (references, errors, adapting)], ctypes.c_int32()
-        self._library.anc_listen.restype = ctypes.c_int64
+        signals = (array.ctypes.data for array in arrays)
         with self.in_use:
-            done = self._library.anc_listen(
-                ctypes.c_void_p(self.algorithm.pointer),
-                self._view,
-                *(ctypes.c_void_p(array.ctypes.data) for array in arrays),
-                ctypes.c_int64(len(arrays[0])),
-                ctypes.byref(answer),
-            )
+            listen = self._library.anc_listen
+            done = listen(self.algorithm.pointer, self._view, *signals, len(arrays[0]), ctypes.byref(answer))
         return done, answer.value
 
     def refilter(self) -> None:

@@ -32,16 +32,8 @@ FLAGS = (
 _PACKAGERS = ("CFLAGS", "CPPFLAGS", "LDFLAGS")
 _REFUSED = (
     *("-ffast-math", "-Ofast", "-funsafe-math-optimizations", "-fassociative-math", "-freciprocal-math"),
-    *(
-        "-ffinite-math-only",
-        "-fno-honor-nans",
-        "-fno-honor-infinities",
-        "-fapprox-func",
-        "-fno-signed-zeros",
-        "-fsingle-precision-constant",
-        "-ffp-contract=fast",
-        "-ffp-contract=on",
-    ),
+    *("-ffinite-math-only", "-fno-honor-nans", "-fno-honor-infinities", "-fapprox-func", "-fno-signed-zeros"),
+    *("-fsingle-precision-constant", "-ffp-contract=fast", "-ffp-contract=on"),
     *("-ffp-model=fast", "-ffp-model=aggressive", "-mfpmath=387", "-mfpmath=both", "-mfpmath=sse+387", "-mdaz-ftz"),
 )
 _REFUSED_BEGINNINGS = ("-mrecip", "-fdenormal-fp-math", "-Wp,-ffast-math")
@@ -203,11 +195,8 @@ def build_core(folder: Path, target: str = "") -> list[Path]:
 
 
 def _system(target: str) -> str:
-    return (
-        target.split("-")[1].split(".")[0]
-        if target
-        else {"Windows": "windows", "Darwin": "macos"}.get(platform.system(), "other")
-    )
+    own = {"Windows": "windows", "Darwin": "macos"}.get(platform.system(), "other")
+    return target.split("-")[1].split(".")[0] if target else own
 
 
 def _is_zig(command: list[str]) -> bool:

@@ -5,13 +5,29 @@ from __future__ import annotations
 import ctypes
 import functools
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from . import building
 
 LEVEL_VARIABLE = "KFOPC_CORE_LEVEL"
 _HOW = "build it from the clone: python -m pip install -e ."
+VISITOR = ctypes.PYFUNCTYPE(
+    None,
+    *(ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_int, ctypes.c_size_t),
+    ctypes.POINTER(ctypes.c_int32),
+)
+# Types of the functions in anc.h that Python calls, first that of the result: - nothing, P a pointer, i and q integers of
+# 32 and 64 bits, N a size, r a number of the core, V a visitor.
+_TYPES = {"-": None, "P": ctypes.c_void_p, "i": ctypes.c_int32, "q": ctypes.c_int64, "N": ctypes.c_size_t, "V": VISITOR}
+_CALLS = {
+    **{"size": "NPP", "open": "iPPPPNi", "describe": "-PPVP", "refilter": "-P", "listen": "qPPPPPqP"},
+    **{"run": "qPPPPiqqP", "hear": "-PPq", "play": "-PPPq", "process": "qPiiiPPPPqqqPP"},
+    **{"preview": "-PPPiPrrr", "commit": "-PPPiPrrr", "limit": "rPPr", "limit_all": "-PPPPq", "amplify_all": "-PPPq"},
+    **{"covariance_size": "Ni", "covariance_describe": "-iVP"},
+    **{"covariance_predict": "-Pirr", "covariance_update": "iPiPPrrP"},
+}
 
 
 class Library(NamedTuple):
@@ -21,6 +37,27 @@ class Library(NamedTuple):
     level: str
     free: ctypes.CDLL  # its calls release the interpreter's lock: other threads run
     held: ctypes.PyDLL  # its calls keep the lock: shorter, and two threads cannot be inside one controller
+
+
+class Field(NamedTuple):
+    """A field of a controller's memory, or of a covariance's, as the core describes it."""
+
+    name: str
+    role: int
+    kind: int  # of its numbers: 0 for those of the core, 1 for integers
+    offset: int  # in bytes
+    shape: tuple[int, ...]
+
+
+def fields_of(describe: Callable[..., None], *what: Any) -> list[Field]:
+    """Return the fields of what a function of the core describes to a visitor."""
+    found: list[Field] = []
+
+    def visit(_: Any, name: bytes, role: int, kind: int, offset: int, axes: Any) -> None:
+        found.append(Field(name.decode(), role, kind, offset, tuple(axes[:4])))
+
+    describe(*what, VISITOR(visit), None)
+    return found
 
 
 @functools.cache
@@ -68,11 +105,15 @@ def _open(real: str, level: str) -> Library:
     try:
         free, held = ctypes.CDLL(str(path)), ctypes.PyDLL(str(path))
     except OSError as error:
-        raise ImportError(
-            f"the C core of kfopc_filterpy does not load ({' '.join(str(error).split())}); {_HOW}"
-        ) from None
+        why = " ".join(str(error).split())
+        raise ImportError(f"the C core of kfopc_filterpy does not load ({why}); {_HOW}") from None
     if building.stamp_of(free) != building.stamp():
         raise ImportError(
-            f"the C core of kfopc_filterpy was built from other sources than those beside it ({path.name}); {_HOW}"
+            f"the C core of kfopc_filterpy, {path.name}, was built from other sources than its own; {_HOW}"
         )
+    types = _TYPES | {"r": ctypes.c_float if real == "float" else ctypes.c_double}
+    for name, letters in _CALLS.items():
+        for library in (free, held):
+            function = getattr(library, f"anc_{name}")
+            function.restype, *function.argtypes = (types[letter] for letter in letters)
     return Library(path, level, free, held)

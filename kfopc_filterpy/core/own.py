@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from . import building
-from .block import VISITOR, Algorithm, _Algorithm, _Plan
-from .library import load
+from .block import Algorithm, _Algorithm, _Plan
+from .library import fields_of, load
 
 CACHE_VARIABLE = "KFOPC_CACHE"
 _MOST_SETTINGS = 8  # ANC_MOST_SETTINGS in signals.h
@@ -177,8 +177,7 @@ def _compile(source: Path, name: str, library: Path) -> None:
             raise building.BuildError(f"{source} does not compile:\n{words}") if words else error from None
         except OSError as error:
             raise building.BuildError(
-                f"the compiled {source.name} cannot be kept in {library.parent} ({error}): "
-                f"let {CACHE_VARIABLE} name another folder"
+                f"{library.parent} cannot keep the compiled {source.name} ({error}): let {CACHE_VARIABLE} name another"
             ) from None
 
 
@@ -228,10 +227,5 @@ def _fault_of_fields(struct: Any) -> str:
 def _fields_of(struct: Any) -> Counter[str]:
     """Return how often `layout` makes each field of the smallest controller."""
     plan = _Plan(scenarios=1, microphones=1, loudspeakers=1, references=1, taps=1, path_taps=1)
-    names: Counter[str] = Counter()
-
-    def take(_: Any, name: bytes, *rest: Any) -> None:
-        names[name.decode()] += 1
-
-    load().held.anc_describe(ctypes.byref(struct), ctypes.byref(plan), VISITOR(take), None)
-    return names
+    described = fields_of(load().held.anc_describe, ctypes.byref(struct), ctypes.byref(plan))
+    return Counter(field.name for field in described)

@@ -30,11 +30,8 @@ class _Controller(ctypes.Structure):
 
 class _Plant(ctypes.Structure):
     _fields_ = [
-        *(
-            (name, ctypes.c_int32)
-            for name in ("scenarios", "microphones", "loudspeakers", "references", "path_taps", "feedback_taps")
-        ),
-        *((name, ctypes.c_int32) for name in ("at", "length")),
+        *((name, ctypes.c_int32) for name in ("scenarios", "microphones", "loudspeakers", "references")),
+        *((name, ctypes.c_int32) for name in ("path_taps", "feedback_taps", "at", "length")),
         *((name, ctypes.c_void_p) for name in ("path", "feedback", "amplifiers", "output")),
         *((name, ctypes.c_void_p) for name in ("reference", "control", "error", "limit")),
     ]
@@ -119,20 +116,10 @@ class Plant:
         length = 4 * longest + 64
         self.reference, self.control, self.error = np.zeros(len(feedback)), np.zeros(S * J), np.zeros(S * K)
         self.limit = np.ascontiguousarray(limit, np.float64)
-        self.secondary, self.feedback, self.amplifiers = (
-            np.array(array, order="C") for array in (secondary, feedback, amplifiers)
-        )
-        self._output = np.zeros((S * J, length))
-        arrays = [
-            self.secondary,
-            self.feedback,
-            self.amplifiers,
-            self._output,
-            self.reference,
-            self.control,
-            self.error,
-            self.limit,
-        ]
+        plant = secondary, feedback, amplifiers, np.zeros((S * J, length))
+        self.secondary, self.feedback, self.amplifiers, self._output = (np.array(array, order="C") for array in plant)
+        arrays = [self.secondary, self.feedback, self.amplifiers, self._output]
+        arrays += [self.reference, self.control, self.error, self.limit]
         counts = (S, K, J, len(feedback), taps, feedback.shape[2], length - longest, length)
         self._struct = _Plant(*counts, *(array.ctypes.data for array in arrays))
         self._signals: Signals | None = None
@@ -146,18 +133,9 @@ class Plant:
         With the status DIVERGED, go on from a divergence at `begin` with the control signals in `control`.
         """
         notes = (_Record * max(len(records), 1))(*(record._struct() for record in records))
-        answer = ctypes.c_int32(status)
-        _library.anc_run.restype = ctypes.c_int64
-        done = _library.anc_run(
-            ctypes.byref(_Controller(*steps)),
-            ctypes.byref(self._struct),
-            self._pointers(signals),
-            notes,
-            ctypes.c_int32(len(records)),
-            ctypes.c_int64(begin),
-            ctypes.c_int64(end),
-            ctypes.byref(answer),
-        )
+        answer, of = ctypes.c_int32(status), ctypes.byref
+        run_of = of(_Controller(*steps)), of(self._struct), self._pointers(signals)
+        done = _library.anc_run(*run_of, notes, len(records), begin, end, of(answer))
         return answer.value, done
 
     def silence(self, scenario: int) -> None:
@@ -175,7 +153,7 @@ class Plant:
 
     def hear(self, signals: Signals, n: int) -> NDArray[np.float64]:
         """Return the references of sample n, (I,)."""
-        _library.anc_hear(ctypes.byref(self._struct), self._pointers(signals), ctypes.c_int64(n))
+        _library.anc_hear(ctypes.byref(self._struct), self._pointers(signals), n)
         return self.reference
 
     def amplified(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -188,12 +166,7 @@ class Plant:
     def play(self, amplified: NDArray[np.float64], signals: Signals, n: int) -> NDArray[np.float64]:
         """Send the amplifiers' outputs, (J,), through the paths; return the errors of sample n, (K,)."""
         self.control[:] = amplified
-        _library.anc_play(
-            ctypes.byref(self._struct),
-            ctypes.c_void_p(self.control.ctypes.data),
-            self._pointers(signals),
-            ctypes.c_int64(n),
-        )
+        _library.anc_play(ctypes.byref(self._struct), self.control.ctypes.data, self._pointers(signals), n)
         return self.error
 
 
@@ -211,15 +184,8 @@ def process(
     Return the status and the first sample that was refused, or `end`.
     """
     scratch, status = np.empty(len(x) + len(y) + len(e)), ctypes.c_int32()
-    _library.anc_process.restype = ctypes.c_int64
-    done = _library.anc_process(
-        ctypes.byref(_Controller(*steps)),
-        *(ctypes.c_int32(len(signal)) for signal in (x, y, e)),
-        *(ctypes.c_void_p(array.ctypes.data) for array in (x, e, y, adapting)),
-        ctypes.c_int64(x.shape[1]),
-        ctypes.c_int64(begin),
-        ctypes.c_int64(end),
-        ctypes.c_void_p(scratch.ctypes.data),
-        ctypes.byref(status),
-    )
+    controller, counts = ctypes.byref(_Controller(*steps)), map(len, (x, y, e))
+    arrays = (array.ctypes.data for array in (x, e, y, adapting))
+    ends = x.shape[1], begin, end
+    done = _library.anc_process(controller, *counts, *arrays, *ends, scratch.ctypes.data, ctypes.byref(status))
     return status.value, done

@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .calls import covariance_fields
+from .calls import covariance_describe, covariance_size
 from .calls import covariance_update as covariance_update
+from .library import fields_of
 
 GROUP = 8  # rows of T that have one length, `PARTS` in vectors.h
 LINE = 64  # bytes in a cache line
@@ -30,7 +31,8 @@ class Covariance(NamedTuple):
 @cache
 def _fields(n: int) -> tuple[int, dict[str, slice]]:
     """Return the size of the memory, and where its fields are, in numbers."""
-    return covariance_fields(n)
+    ends = {field.name: (field.offset // 8, int(np.prod(field.shape))) for field in fields_of(covariance_describe, n)}
+    return covariance_size(n) // 8, {name: slice(begin, begin + size) for name, (begin, size) in ends.items()}
 
 
 DIRECTION = _fields(1)[1]["gain_direction"].start  # of every n: what stands before has a fixed size

@@ -142,9 +142,7 @@ def export_c(
     path = Path(path)
     in_folder = path.is_dir() or not path.suffix
     if not in_folder and path.suffix != ".c":
-        raise ValueError(
-            f"path must end in .c, or be a folder; one with a dot in its name must exist, got {str(path)!r}"
-        )
+        raise ValueError(f"path must end in .c, or be a folder; one with a dot must exist, got {str(path)!r}")
     name = checked_name(("anc" if in_folder else path.stem) if name is None else name)
     if in_folder and name == "main":
         raise ValueError("name must not be 'main', whose main.c is the example")

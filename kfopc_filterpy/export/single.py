@@ -71,6 +71,5 @@ class Float32Controller:
 
     def _require(self, answer: int) -> None:
         if answer:
-            raise ValueError(
-                f"{reason_of(answer)} (in float32: 1e6 for 1e25 and 1e50, 1e12 for 1e100); nothing was changed"
-            )
+            limits = "in float32: 1e6 for 1e25 and 1e50, 1e12 for 1e100"
+            raise ValueError(f"{reason_of(answer)} ({limits}); nothing was changed")

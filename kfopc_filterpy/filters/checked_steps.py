@@ -153,9 +153,7 @@ def checked_measurement(
     noise = kf.R if R is None else R
     size = kf.dim_z if np.isscalar(R) else len(np.atleast_1d(noise))  # filterpy makes a number that is passed a matrix
     if size != rows and (np.isscalar(R) or np.ndim(noise)):
-        raise ValueError(
-            f"R must have shape ({rows}, {rows}), a row for each of H, got {noise!r} for dim_z = {kf.dim_z}"
-        )
+        raise ValueError(f"R must have shape ({rows}, {rows}), as H has rows, got {noise!r} for dim_z = {kf.dim_z}")
     require_variance(noise, rows, "R")
     if np.shape(noise) == (1,):
         R = np.reshape(noise, (1, 1))
@@ -217,9 +215,7 @@ def without_masked(kf: KalmanFilter, z: np.ma.MaskedArray, R: Any, H: Any) -> tu
     size = missing.size
     row, noise = np.array(kf.H if H is None else H), np.array(kf.R if R is None else R)
     if row.shape != (size, kf.dim_x):
-        raise ValueError(
-            f"z must have {len(np.atleast_2d(row))} value(s), the masked ones included, got shape {z.shape}"
-        )
+        raise ValueError(f"z must have {len(np.atleast_2d(row))} value(s), with the masked ones, got shape {z.shape}")
     require_variance(noise, size, "R")
     noise = noise * np.eye(size) if noise.ndim == 0 else noise.astype(np.float64)
     row[missing], noise[missing], noise[:, missing] = 0.0, 0.0, 0.0

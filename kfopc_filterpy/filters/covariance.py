@@ -157,9 +157,7 @@ def require_covariance(P: np.ndarray, name: str = "P") -> None:
     difference = np.abs(P - P.T)
     if difference.max() > ASYMMETRY_LIMIT * np.abs(P).max():
         i, j = np.unravel_index(np.argmax(difference), P.shape)
-        raise ValueError(
-            f"{name} must be symmetric, but {name}[{i}, {j}] = {P[i, j]:g} and {name}[{j}, {i}] = {P[j, i]:g}"
-        )
+        raise ValueError(f"{name} must be symmetric, but [{i}, {j}] holds {P[i, j]:g} and [{j}, {i}] {P[j, i]:g}")
     require_semidefinite(P, name, INDEFINITE_LIMIT)
 
 

@@ -174,9 +174,7 @@ def consistency(
     y, there = _innovations(innovations)
     n_runs, n_samples, rows = y.shape
     if n_samples <= max_lag:
-        raise ValueError(
-            f"there must be more than max_lag = {max_lag} samples, got {n_samples}; give a smaller max_lag"
-        )
+        raise ValueError(f"there must be more than max_lag = {max_lag} samples, got {n_samples}; lower max_lag")
     if not there.any():
         raise ValueError("there must be a measurement, but all innovations are masked")
     # An innovation that is missing has unit variance and is zero, so it adds nothing.
@@ -254,9 +252,7 @@ def _errors(x: Any, truth: Any, n_runs: int, n_samples: int) -> np.ndarray:
     """Return the errors of the estimates, (n_runs, n_samples, n)."""
     states = as_real_array(truth, "truth")
     if states.ndim < 2:
-        raise ValueError(
-            f"truth must be ([n_runs,] n_samples, n), got shape {states.shape}; give one column for each state"
-        )
+        raise ValueError(f"truth must be ([n_runs,] n_samples, n), a column for each state, got shape {states.shape}")
     shape = n_runs, n_samples, states.shape[-1]
     if n_runs > 1 and states.ndim == 2:  # one truth for all runs
         states = np.broadcast_to(states, (n_runs, *states.shape))

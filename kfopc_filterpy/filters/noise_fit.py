@@ -147,9 +147,7 @@ def fit_noise(
     R_matrices, R_fixed = _parts(R_parts, kf.R, rows, "R")
     n_q, n_parts = len(Q_matrices), len(Q_matrices) + len(R_matrices)
     if not n_parts:
-        raise ValueError(
-            "nothing to learn: Q_parts and R_parts are both empty; leave one of them out, or give a matrix"
-        )
+        raise ValueError("nothing to learn: Q_parts and R_parts are both empty; leave one out, or give a matrix")
     if record.there.sum() <= n_parts:
         raise ValueError(f"z must hold more than {n_parts} measurements for {n_parts} noises, got {record.there.sum()}")
 

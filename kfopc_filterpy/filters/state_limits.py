@@ -164,9 +164,7 @@ def _all_inequalities(inequalities: Any, lower: Any, upper: Any, n: int) -> tupl
     for name, value, free in (("lower", lower, -np.inf), ("upper", upper, np.inf)):
         limit = as_real_array(free if value is None else value, name)
         if limit.shape not in ((), (n,)) or np.any(np.isnan(limit)) or np.any(limit == -free):
-            raise ValueError(
-                f"{name} must be one number or ({n},), with {free:g} for a state without one, got {value!r}"
-            )
+            raise ValueError(f"{name} must be one number or ({n},), {free:g} for a state without one, got {value!r}")
         ends[name] = np.broadcast_to(limit, n)
     if np.any(crossed := ends["lower"] > ends["upper"]):
         i = int(np.argmax(crossed))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .._types import PathModel
 from .._validate import as_band, as_number, as_positive, as_signal
-from .models import finite_taps, is_system, path_taps, sampling_rate
+from .models import finite_taps, path_taps, sampling_rate
 from .path_matrix import PRIMARY_AXES, SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 
 STABILITY_BOUND_DEG = 90.0
@@ -45,19 +45,12 @@ def frequency_response(path: PathModel, frequencies_hz: ArrayLike, *, fs: float 
     >>> frequency_response([0.5, 0.5], [0.0, 2000.0, 4000.0], fs=8000.0).round(3)
     array([1. +0.j , 0.5-0.5j, 0. -0.j ])
     """
-    fs = sampling_rate(path, fs)
-    omega = 2 * np.pi * _frequencies(frequencies_hz, fs) / fs
-    return _response(path, omega)
-
-
-def _finite_taps(path: Any) -> np.ndarray | None:
-    """Return the taps of a path; None if its response is infinite."""
-    return finite_taps(path) if is_system(path) else as_signal(path, "path")
+    return _response(path, _radians(frequencies_hz, sampling_rate(path, fs)))
 
 
 def _response(path: Any, omega: np.ndarray) -> np.ndarray:
     """Return the response at frequencies in rad/sample."""
-    taps = _finite_taps(path)
+    taps = finite_taps(path)
     if taps is None:
         return np.asarray(path(np.exp(1j * omega)))
     from scipy.signal import freqz
@@ -67,7 +60,7 @@ def _response(path: Any, omega: np.ndarray) -> np.ndarray:
 
 def _response_on_grid(path: Any, n_frequencies: int) -> np.ndarray:
     """Return the response at evenly spaced frequencies from 0 to fs/2, by one FFT if the response is finite."""
-    taps = _finite_taps(path)
+    taps = finite_taps(path)
     if taps is None:
         return _response(path, np.linspace(0.0, np.pi, n_frequencies))
     period = 2 * (n_frequencies - 1)  # taps a period apart have the same phase at all of these frequencies
@@ -84,14 +77,12 @@ def responses_of_both(
     return frequency_response(path, frequencies_hz, fs=fs), frequency_response(estimate, frequencies_hz, fs=fs)
 
 
-def _frequencies(frequencies_hz: Any, fs: float) -> np.ndarray:
-    frequencies = as_signal(frequencies_hz, "frequencies_hz")
-    if frequencies.min() < 0 or frequencies.max() > fs / 2:
-        raise ValueError(
-            f"frequencies_hz must lie within 0 to fs/2 = {fs / 2:g} Hz, got "
-            f"{frequencies.min():g} to {frequencies.max():g} Hz"
-        )
-    return frequencies
+def _radians(frequencies_hz: Any, fs: float) -> np.ndarray:
+    """Return frequencies in Hz as radians per sample."""
+    f = as_signal(frequencies_hz, "frequencies_hz")
+    if f.min() < 0 or f.max() > fs / 2:
+        raise ValueError(f"frequencies_hz must lie within 0 to fs/2 = {fs / 2:g} Hz, got {f.min():g} to {f.max():g} Hz")
+    return 2 * np.pi * f / fs
 
 
 def group_delay(path: PathModel, frequencies_hz: ArrayLike, *, fs: float | None = None) -> np.ndarray:
@@ -122,18 +113,15 @@ def group_delay(path: PathModel, frequencies_hz: ArrayLike, *, fs: float | None 
     0.00025
     """
     fs = sampling_rate(path, fs)
-    omega = 2 * np.pi * _frequencies(frequencies_hz, fs) / fs
-    taps = _finite_taps(path)
+    omega, taps = _radians(frequencies_hz, fs), finite_taps(path)
     if taps is None:
         step = 1e-4
         before, after = _response(path, omega - step), _response(path, omega + step)
         return np.angle(before * np.conj(after)) / (2 * step * fs)
     response = _response(taps, omega)
     ramped = _response(taps * np.arange(taps.size), omega)  # transform of n h[n]
-    zero = np.abs(response) <= 1e-12 * np.sum(np.abs(taps))
-    delay = np.full(omega.size, np.nan)
-    delay[~zero] = np.real(ramped[~zero] / response[~zero]) / fs
-    return delay
+    heard = np.abs(response) > 1e-12 * np.sum(np.abs(taps))
+    return np.where(heard, np.real(ramped / np.where(heard, response, 1.0)), np.nan) / fs
 
 
 def secondary_path_gain(
@@ -176,6 +164,8 @@ def secondary_path_gain(
     >>> secondary_path_gain([0.0, 2.0])
     4.0
     """
+    from scipy.signal import correlate
+
     taps = path_taps(path, fs=fs)
     if reference is not None:
         if band is not None:
@@ -186,17 +176,9 @@ def secondary_path_gain(
     fs = sampling_rate(path, fs)
     low, high = as_band(band, fs)
     # |S|² is the cosine series of the taps' autocorrelation; its mean over a band integrates term by term.
-    lags = np.arange(taps.size)
-    autocorrelation = _autocorrelation(taps)
+    lags, autocorrelation = np.arange(taps.size), correlate(taps, taps)[taps.size - 1 :]
     mean_cosine = (high * np.sinc(2 * lags * high / fs) - low * np.sinc(2 * lags * low / fs)) / (high - low)
     return float(autocorrelation[0] + 2 * autocorrelation[1:] @ mean_cosine[1:])
-
-
-def _autocorrelation(taps: np.ndarray) -> np.ndarray:
-    """Return the autocorrelation at lags from 0 on, of a long response by FFT: the direct sum is quadratic."""
-    from scipy.signal import correlate
-
-    return correlate(taps, taps)[taps.size - 1 :]
 
 
 def _gain_for_reference(taps: np.ndarray, reference: Any) -> float:
@@ -394,12 +376,12 @@ class CausalityMargin:
     @property
     def margins_s(self) -> np.ndarray:
         """Margins by energy onset in s, shape (K, J), one for each pair; -inf for a silent secondary path."""
-        return _pairwise(self.primary_onset_s, self.secondary_onset_s)
+        return np.atleast_1d(self.primary_onset_s)[:, np.newaxis] - np.atleast_2d(self.secondary_onset_s)
 
     @property
     def margin_s(self) -> float:
         """Margin by energy onset in s, primary minus secondary, of the whole; a negative one is not causal."""
-        return _of_the_whole(self.margins_s)
+        return float(self.margins_s.max(axis=1).min())
 
     @property
     def margin_samples(self) -> float:
@@ -415,26 +397,17 @@ class CausalityMargin:
     @property
     def group_delay_margins_s(self) -> np.ndarray:
         """Margins by mean group delay in s, shape (K, J), one for each pair; -inf for a silent secondary path."""
-        return _pairwise(self.primary_delay_s, self.secondary_delay_s)
+        return np.atleast_1d(self.primary_delay_s)[:, np.newaxis] - np.atleast_2d(self.secondary_delay_s)
 
     @property
     def group_delay_margin_s(self) -> float:
         """Margin by mean group delay in s, of the whole."""
-        return _of_the_whole(self.group_delay_margins_s)
+        return float(self.group_delay_margins_s.max(axis=1).min())
 
     @property
     def group_delay_margin_samples(self) -> float:
         """Margin by mean group delay in samples."""
         return self.group_delay_margin_s * self.fs
-
-
-def _pairwise(primary: Any, secondary: Any) -> np.ndarray:
-    return np.atleast_1d(primary)[:, np.newaxis] - np.atleast_2d(secondary)
-
-
-def _of_the_whole(margins: np.ndarray) -> float:
-    """Return the margin (K, J) of each microphone's best loudspeaker, at the worst microphone."""
-    return float(margins.max(axis=1).min())
 
 
 def energy_onset(taps: np.ndarray, share: float = 0.01) -> int:
@@ -511,9 +484,7 @@ def causality_margin(
         p, s = (path_taps(h, name=n).reshape(1, 1, -1) for h, n in ((primary, "primary"), (secondary, "secondary")))
     low, high = (0.0, fs / 2) if band is None else as_band(band, fs)
     if len(p) != len(s):
-        raise ValueError(
-            f"primary and secondary must have the same K microphones as their first axis, got {len(p)} and {len(s)}"
-        )
+        raise ValueError(f"primary and secondary must have the same K microphones first, got {len(p)} and {len(s)}")
     for name, paths, source in (("primary", p, "reference"), ("secondary", s, "loudspeaker")):
         for k in np.flatnonzero(~np.any(paths, axis=(1, 2))):
             which, why = name, "a silent path has no delay"

@@ -180,9 +180,8 @@ def estimate_path(
 def require_audible(recorded: Mapping[str, np.ndarray], n_taps: int) -> None:
     """Raise ValueError if a signal, (..., n_samples), is silent where it is fitted; the message gives its index."""
     for name, signals in recorded.items():
-        silent = np.argwhere(~np.any(signals[..., n_taps - 1 :], axis=-1))
-        if len(silent):
-            index = "".join(f"[{i}]" for i in silent[0])
+        for silent in np.argwhere(~np.any(signals[..., n_taps - 1 :], axis=-1)):
+            index = "".join(f"[{i}]" for i in silent)
             raise ValueError(f"{name}{index} must not be silent: it does not reveal the path")
 
 
@@ -403,7 +402,11 @@ def identify_secondary_path(
     several = is_path_matrix(secondary_path)
     if several:
         true, fs = sampled_path_matrix(secondary_path, fs, "secondary_path", SECONDARY_AXES)
-        _require_sound(true)
+        for k, j in np.argwhere(~np.any(true, axis=2)):
+            raise ValueError(
+                f"secondary_path[{k}][{j}] must not be all zeros: an error relative to it is undefined; leave out the "
+                "loudspeaker if it is unplugged, or the microphone if it is dead"
+            )
     else:
         fs = sampling_rate(secondary_path, fs, name="secondary_path")
         true = path_taps(secondary_path, name="secondary_path").reshape(1, 1, -1)
@@ -441,17 +444,6 @@ def identify_secondary_path(
         modelling_error_db=errors if several else errors[0, 0],
         misalignment_db=misalignments if several else float(misalignments[0, 0]),
     )
-
-
-def _require_sound(paths: np.ndarray) -> None:
-    """Raise ValueError if a path is silent: an error relative to it is undefined."""
-    silent = np.argwhere(~np.any(paths, axis=2))
-    if silent.size:
-        k, j = silent[0]
-        raise ValueError(
-            f"secondary_path[{k}][{j}] must not be all zeros: an error relative to it is undefined; leave out the "
-            "loudspeaker if it is unplugged, or the microphone if it is dead"
-        )
 
 
 def _excitation(kind: str, n_samples: int, fs: float, level: float, rng: np.random.Generator) -> np.ndarray:

@@ -119,7 +119,5 @@ def ridge_solve(signals: np.ndarray, right: np.ndarray, ridges: np.ndarray) -> n
     )
     solved = [cg(matrix, b, rtol=_PRECISION, maxiter=_MOST_STEPS, M=preconditioner) for b in right]
     if any(reason for _, reason in solved):
-        raise ValueError(
-            f"{n_weights} weights were not found in {_MOST_STEPS} steps: fit fewer taps, to a longer recording"
-        )
+        raise ValueError(f"{n_weights} weights were not found in {_MOST_STEPS} steps: fit fewer taps, or record longer")
     return np.array([weights for weights, _ in solved])

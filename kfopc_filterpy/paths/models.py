@@ -70,9 +70,7 @@ def bandpass_path(
     n_taps = as_count(n_taps, "n_taps", minimum=3)
     low, high = as_band(band, fs)
     if low == 0 and high == fs / 2:
-        raise ValueError(
-            f"band must leave out some of 0 to fs/2, got ({low:g}, {high:g}) Hz; for a flat path use fir_path"
-        )
+        raise ValueError(f"band must not be all of 0 to fs/2, ({low:g}, {high:g}) Hz: for a flat path use fir_path")
     if high == fs / 2 and n_taps % 2 == 0:
         raise ValueError(f"n_taps must be odd for a band that reaches fs/2, got {n_taps}; use {n_taps + 1}")
     edges = [edge for edge in (low, high) if 0 < edge < fs / 2]
@@ -117,9 +115,7 @@ def fir_path(taps: ArrayLike, fs: float, name: str | None = None) -> control.Tra
     if not np.any(taps):
         raise ValueError("taps must not all be zero: such a path carries no sound")
     fs = as_positive(fs, "fs", unit="Hz")
-    denominator = np.zeros(taps.size)
-    denominator[0] = 1.0
-    return TransferFunction(taps, denominator, 1 / fs, **({} if name is None else {"name": name}))
+    return TransferFunction(taps, np.eye(1, taps.size)[0], 1 / fs, **({} if name is None else {"name": name}))
 
 
 def is_system(path: object) -> TypeGuard[System]:
@@ -185,16 +181,18 @@ def sampling_rate(path: PathModel, fs: float | None = None, *, name: str = "path
     return rate if fs is None else fs
 
 
-def finite_taps(system: System) -> np.ndarray | None:
-    """Return the exact taps of a system with a finite impulse response, or None for other systems."""
-    if hasattr(system, "A"):  # D, CB, CAB, ... until A^n B is 0, which n states do not outlast
-        state, taps = system.B, [system.D]
-        for _ in range(len(system.A)):
-            taps, state = [*taps, system.C @ state], system.A @ state
+def finite_taps(path: PathModel, name: str = "path") -> np.ndarray | None:
+    """Return the exact taps of a path, or None for a system with an infinite impulse response."""
+    if not is_system(path):
+        return as_signal(path, name)
+    if hasattr(path, "A"):  # D, CB, CAB, ... until A^n B is 0, which n states do not outlast
+        state, taps = path.B, [path.D]
+        for _ in range(len(path.A)):
+            taps, state = [*taps, path.C @ state], path.A @ state
         return None if np.any(state) else np.ravel(taps)
-    if not hasattr(system, "num_array"):
+    if not hasattr(path, "num_array"):
         return None
-    numerator, denominator = system.num_array[0, 0], system.den_array[0, 0]
+    numerator, denominator = path.num_array[0, 0], path.den_array[0, 0]
     if np.any(denominator[1:]):
         return None
     # python-control strips the leading zeros of the numerator, which are the delay of the path.
@@ -238,11 +236,9 @@ def path_taps(path: PathModel, *, fs: float | None = None, n_taps: int | None = 
         n_taps = as_count(n_taps, "n_taps")
     if tells_rate(path):
         sampling_rate(path, fs, name=name)
-    if not is_system(path):
-        return _cut(as_signal(path, name), n_taps, name)
-    if hasattr(path, "num_array") and path.num_array[0, 0].size > path.den_array[0, 0].size:
+    if is_system(path) and hasattr(path, "num_array") and path.num_array[0, 0].size > path.den_array[0, 0].size:
         raise ValueError(f"{name} must be causal, but its numerator has a higher degree than its denominator")
-    taps = finite_taps(path)
+    taps = finite_taps(path, name)
     if taps is None:
         if n_taps is None:
             raise ValueError(

@@ -90,15 +90,11 @@ def realize_paths(paths: PathModels, order: int, *, fs: float | None = None) -> 
     if order > most:
         raise ValueError(f"order must be at most {most} for paths of shape {taps.shape}, got {order}")
     if not np.any(taps[..., 1:]):
-        raise ValueError(
-            "paths must have a tap other than the first that is not zero: paths without memory have no states"
-        )
+        raise ValueError("paths must have a tap other than the first that is not zero, or they have no states")
     padded = np.concatenate([taps, np.zeros((outputs, inputs, n_taps + 1))], axis=2)
     balanced, sizes = eigensys_realization(padded, order, m=n_taps, n=n_taps)
-    if not sizes[order - 1] > 1e-13 * sizes[0]:
-        raise ValueError(
-            f"order must be at most {np.sum(sizes > 1e-13 * sizes[0])}, the number of states that the paths have"
-        )
+    if order > (most := np.sum(sizes > 1e-13 * sizes[0])):
+        raise ValueError(f"order must be at most {most}, the number of states that the paths have, got {order}")
     system = StateSpace(balanced.A, balanced.B, balanced.C, balanced.D, 1 / fs)
     return PathRealization(system, _residual_db(taps, system))
 

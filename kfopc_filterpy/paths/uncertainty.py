@@ -211,12 +211,9 @@ def _distance(measured: np.ndarray, estimate: np.ndarray) -> np.ndarray:
     """Return the largest relative distance of measured paths from the estimate, at each frequency."""
     several = measured[:, np.newaxis, np.newaxis] if measured.ndim == 2 else measured
     if several.ndim != 4 or several.shape[1:3] != estimate.shape[:2] or 0 in several.shape:
-        wanted = (
-            "(M, n_taps)" if estimate.shape[:2] == (1, 1) else f"(M, {estimate.shape[0]}, {estimate.shape[1]}, n_taps)"
-        )
-        raise ValueError(
-            f"secondary_path_uncertainty must be {wanted} if it holds M measured paths, got shape {measured.shape}"
-        )
+        K, J, _ = estimate.shape
+        wanted = "(M, n_taps)" if K == J == 1 else f"(M, {K}, {J}, n_taps)"
+        raise ValueError(f"secondary_path_uncertainty of M measured paths must be {wanted}, got shape {measured.shape}")
     known = _response(estimate)
     error = _response(several) - known
     relative = _norm(error @ np.linalg.pinv(known))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..filters.filter_consistency import Consistency
-from .style import legend_above, line_style, new_axes
+from .style import labelled, line_style, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,6 +71,5 @@ def plot_consistency(result: Consistency, *, ax: Sequence[Axes] | None = None) -
     axes[-1].set(xlabel="Lag (samples)", ylabel="Correlation")
     axes[-1].xaxis.get_major_locator().set_params(integer=True)
     for panel in axes:
-        panel.grid(True, alpha=0.3)
-        legend_above(panel)
+        labelled(panel)
     return axes

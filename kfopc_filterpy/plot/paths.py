@@ -27,8 +27,19 @@ from ..paths.analysis import (
     secondary_path_gain,
 )
 from ..paths.identification import IdentificationResult
-from ..paths.models import finite_taps, is_system, path_taps, sampling_rate
-from .style import MARK, audible, decibels, frequency_axis, legend_above, level_axis, line_style, new_axes, phase_axis
+from ..paths.models import finite_taps, path_taps, sampling_rate
+from .style import (
+    MARK,
+    audible,
+    decibels,
+    frequency_axis,
+    labelled,
+    legend_above,
+    level_axis,
+    line_style,
+    new_axes,
+    phase_axis,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -107,23 +118,16 @@ def plot_bode(
         response = frequency_response(path, frequencies, fs=fs)
         powers.append(np.abs(response) ** 2)
         magnitude.plot(frequencies, decibels(powers[-1]), label=label, **line_style(i))
-        delay = _onset_s(path, fs)
+        taps = finite_taps(path)
+        delay = 0.0 if taps is None else energy_onset(taps) / sampling_rate(path, fs)
         angle = np.rad2deg(np.unwrap(np.angle(response * np.exp(2j * np.pi * frequencies * delay))))
         angle[~audible(response)] = np.nan
         phase.plot(frequencies, angle, label=f"{label}, less {1e3 * delay:.2f} ms", **line_style(i))
     level_axis(magnitude, powers, "Magnitude (dB)")
     phase_axis(phase, "Phase less onset delay (degrees)")
-    frequency_axis(magnitude, frequencies, label=False)
+    frequency_axis(magnitude, frequencies).set_xlabel("")
     frequency_axis(phase, frequencies)
-    legend_above(magnitude)
-    legend_above(phase)
     return axes
-
-
-def _onset_s(path: Any, fs: float | None) -> float:
-    """Return the energy onset of a path in s, 0 for an infinite response."""
-    taps = finite_taps(path) if is_system(path) else as_signal(path, "path")
-    return 0.0 if taps is None else energy_onset(taps) / sampling_rate(path, fs)
 
 
 def plot_impulse_responses(
@@ -164,10 +168,8 @@ def plot_impulse_responses(
     for i, (label, path) in enumerate(_named(paths).items()):
         taps, rate = path_taps(path, name=label), sampling_rate(path, fs, name=label)
         ax.plot(1e3 * np.arange(taps.size) / rate, taps, label=label, **line_style(i))
-    ax.set(xlabel="Time (ms)", ylabel="Impulse response")
     ax.margins(x=0)
-    ax.grid(True, alpha=0.3)
-    return legend_above(ax)
+    return labelled(ax, xlabel="Time (ms)", ylabel="Impulse response")
 
 
 def plot_group_delay(
@@ -214,8 +216,7 @@ def plot_group_delay(
         delay = np.where(heard, group_delay(path, frequencies, fs=fs), np.nan)
         ax.plot(frequencies, 1e3 * delay, label=label, **line_style(i))
     ax.set_ylabel("Group delay (ms)")
-    frequency_axis(ax, frequencies)
-    return legend_above(ax)
+    return frequency_axis(ax, frequencies)
 
 
 def plot_causality_margin(
@@ -284,9 +285,7 @@ def _draw_onsets(margin: CausalityMargin, paths: Mapping[str, Any], ax: Axes) ->
     # The late reverberation does not affect the margin.
     ax.set_xlim(0, 2 * max(*onsets, 1e3 * margin.primary_delay_s, 1e3 * margin.secondary_delay_s))
     ax.set_ylim(-1.4, 1.15)
-    ax.set(xlabel="Time (ms)", ylabel="Impulse response / peak")
-    ax.grid(True, alpha=0.3)
-    legend_above(ax)
+    labelled(ax, xlabel="Time (ms)", ylabel="Impulse response / peak")
 
 
 def _draw_margins(margin: CausalityMargin, ax: Axes) -> None:
@@ -372,8 +371,7 @@ def plot_secondary_path_gain(
     if band is not None:
         ax.axvspan(*ends, color=line_style(1)["color"], alpha=0.08, linewidth=0, label="Band of the white noise")
     level_axis(ax, [power], "Power gain (dB)")
-    frequency_axis(ax, frequencies)
-    return legend_above(ax)
+    return frequency_axis(ax, frequencies)
 
 
 def plot_phase_error(
@@ -434,8 +432,7 @@ def plot_phase_error(
     bound.set_label("Stability bound ±90°")
     ax.set_ylim(-180, 180)
     phase_axis(ax, "Phase error (degrees)")
-    frequency_axis(ax, frequencies)
-    return legend_above(ax)
+    return frequency_axis(ax, frequencies)
 
 
 def plot_required_rated_power(
@@ -477,15 +474,16 @@ def plot_required_rated_power(
     >>> plt.close(ax.figure)
     """
     marked = None if rated_power is None else as_positive(rated_power, "rated_power")
-    known = {
-        "disturbance_power": solution.disturbance_power,
-        "antinoise_power": min(solution.antinoise_power, solution.disturbance_power),
-        "control_power": solution.control_power,
-    }
     limit = solution.noise_reduction_db
     shown = min(limit, 60.0)  # a noiseless tone can be cancelled to rounding
     wanted = np.linspace(0.02, 0.999, 400) * shown
-    needed = required_rated_power(wanted, **known, beyond="inf")
+    needed = required_rated_power(
+        wanted,
+        disturbance_power=solution.disturbance_power,
+        antinoise_power=min(solution.antinoise_power, solution.disturbance_power),
+        control_power=solution.control_power,
+        beyond="inf",
+    )
     ax = new_axes(ax)
     each = needed.rated_power.reshape(wanted.size, -1).T
     for j, powers in enumerate(each):
@@ -494,10 +492,8 @@ def plot_required_rated_power(
     ax.axvline(limit, label=f"Wiener filter unconstrained: {limit:.1f} dB", **line_style(len(each)))
     if marked is not None:
         ax.axhline(marked, label=f"Rated power {marked:g}", **line_style(len(each) + 1))
-    ax.set(xlabel="Noise reduction (dB)", ylabel="Rated power needed (mean square)")
     ax.set_xlim(0, 1.05 * shown)
-    ax.grid(True, which="major", alpha=0.3)
-    return legend_above(ax)
+    return labelled(ax, xlabel="Noise reduction (dB)", ylabel="Rated power needed (mean square)")
 
 
 def plot_modelling_error(
@@ -546,5 +542,4 @@ def plot_modelling_error(
         for n, error in enumerate(errors):
             ax.plot(result.frequencies_hz, error, label=None if n else text, **line_style(i))
     ax.set_ylabel("Modelling error (dB)")
-    frequency_axis(ax, np.concatenate([result.frequencies_hz for result in named.values()]))
-    return legend_above(ax)
+    return frequency_axis(ax, np.concatenate([result.frequencies_hz for result in named.values()]))

@@ -43,20 +43,21 @@ class Curve(NamedTuple):
         """Return the label, with the time of a divergence, and the line style of a smooth curve."""
         return {"label": _label(self), **self.style, "marker": ""}
 
-    def draw(self, ax: Axes, x: np.ndarray, y: np.ndarray, i: int) -> None:
-        """Draw `y`, (n,) or (n_loudspeakers, n), thin, solid and with sparse markers: dashes are lost in a noisy curve.
+    def draw(self, ax: Axes, y: np.ndarray, i: int, samples: np.ndarray | None = None) -> None:
+        """Draw some samples of `y`, (n,) or (n_loudspeakers, n), over time, thin, solid and with sparse markers.
 
         The markers of the i-th curve lie between those of the others. The loudspeakers of a run look alike.
         """
+        samples = thinned(y.shape[-1]) if samples is None else samples
         style = {**self.line(), "linestyle": "-", "linewidth": 1.0, "markersize": 4.5}
-        rows = np.atleast_2d(y)
+        rows = np.atleast_2d(y)[:, samples]
         if len(rows) > 1:
             style["label"] += f", {len(rows)} loudspeakers"
         for row in rows:
             drawn = style
             if np.any(np.isfinite(row) & (row != 0)):  # matplotlib cannot place markers along a curve without points
                 drawn = style | {"marker": self.style["marker"], "markevery": (0.02 + 0.025 * (i % 4), 0.1)}
-            ax.plot(x, row, **drawn)
+            ax.plot((samples + 1) / self.run.fs, row, **drawn)
             style = style | {"label": None}
 
 
@@ -163,18 +164,10 @@ def span_of(run: SimulationResult, span_s: tuple[float, float]) -> slice:
     return part
 
 
-def span_axis(ax: Axes, span_s: tuple[float, float]) -> float:
-    """Set the time axis to a span, in ms if it is short; return its units in a second."""
-    start, end = span_s
-    per_second, unit = (1e3, "ms") if end - start < 0.5 else (1.0, "s")
-    ax.set_xlim(start * per_second, end * per_second)
-    ax.set_xlabel(f"Time ({unit})")
-    ax.grid(True, alpha=0.3)
-    return per_second
-
-
-def times(run: SimulationResult, part: slice, per_second: float) -> np.ndarray:
-    """Return the times of the samples of `part`."""
+def span_times(ax: Axes, run: SimulationResult, part: slice, span_s: tuple[float, float]) -> np.ndarray:
+    """Set the time axis to a span, in ms if it is short; return the times of its samples, `part`."""
+    per_second, unit = (1e3, "ms") if span_s[1] - span_s[0] < 0.5 else (1.0, "s")
+    ax.set(xlim=(span_s[0] * per_second, span_s[1] * per_second), xlabel=f"Time ({unit})")
     return np.arange(part.start, part.stop) / run.fs * per_second
 
 

@@ -30,7 +30,7 @@ from .._validate import as_choice, as_count, as_number, as_positive, as_real_arr
 from .._writing import made_folder, replacing
 from ..metrics import nse_db, short_time_power
 from .results import DISTURBANCE, RATED, Curve, Results, curves, named_styles, one_channel, thinned
-from .style import legend_above, new_axes
+from .style import labelled, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,9 +79,7 @@ def plot_weight_history(results: Results, *, tap: int | tuple[int, int, int], ax
     for curve in shown:
         weights = curve.run.weights
         if weights is None:
-            raise ValueError(
-                f"results {curve.label!r} hold no weights; simulate with record_weights_every=, such as 16"
-            )
+            raise ValueError(f"results {curve.label!r} hold no weights; simulate with record_weights_every=16")
         if len(index) != weights.ndim - 1:
             expected = "an index" if weights.ndim == 2 else "(loudspeaker, reference, tap)"
             raise ValueError(f"tap must be {expected} for the weights of {curve.label!r}, got {tap!r}")
@@ -165,7 +163,7 @@ def plot_nse(
         rows = thinned(nse.size, width // 4, most=8000)
         if scale == "log":
             rows = np.unique(np.geomspace(1, nse.size, 2000).astype(int)) - 1
-        curve.draw(ax, (rows + 1) / curve.run.fs, nse[rows], i)
+        curve.draw(ax, nse, i, rows)
     ax.axhline(0.0, color=DISTURBANCE["color"], linewidth=1.0, zorder=1.5)
     _over_time(ax, shown, f"Normalised squared error (dB)\nover {_window_in_words(window_s)}")
     if scale == "log":
@@ -241,7 +239,8 @@ def plot_output_power(
         rated = sorted({float(power) for each in powers for power in np.atleast_1d(each)})
     else:
         rated = [as_positive(rated_power, "rated_power")]
-    scale, unit = (1.0, "") if watt_per_power is None else (as_positive(watt_per_power, "watt_per_power"), " W")
+    scale = 1.0 if watt_per_power is None else as_positive(watt_per_power, "watt_per_power")
+    unit = "" if watt_per_power is None else " W"
     rated = [scale * value for value in rated]
     short_time = [
         scale * short_time_power(curve.stack("control_signal", channel=channel), curve.run.fs, window_s, runs=True)
@@ -250,8 +249,7 @@ def plot_output_power(
     ax = new_axes(ax)
     highest = 0.0
     for i, (curve, power) in enumerate(zip(shown, short_time, strict=True)):
-        rows = thinned(curve.run.n_samples)
-        curve.draw(ax, (rows + 1) / curve.run.fs, power[..., rows], i)
+        curve.draw(ax, power, i)
         highest = max(highest, np.max(power, initial=0.0, where=~np.isnan(power)))
     for value in rated:
         ax.axhline(value, label=f"Rated power {value:.4g}{unit}", **RATED)
@@ -306,8 +304,7 @@ def plot_constraint_factor(results: Results, *, channel: int | None = None, ax: 
         factors = [one_channel(factor, channel) for factor in factors]
     ax = new_axes(ax)
     for i, (curve, factor) in enumerate(zip(shown, factors, strict=True)):
-        rows = thinned(curve.run.n_samples)
-        curve.draw(ax, (rows + 1) / curve.run.fs, factor[..., rows], i)
+        curve.draw(ax, factor, i)
     ax.set_ylim(0, 1.05)
     return _over_time(ax, shown, "Constraint factor α")
 
@@ -368,9 +365,7 @@ def plot_noise_reduction_against_overdrive(
         ax.axvline(flip, **RATED)
     if flips:
         ax.get_lines()[-1].set_label(f"Order flips at {', '.join(f'{flip:.1f}' for flip in flips)} dB")
-    ax.set(xlabel="Overdrive (dB)", ylabel="Noise reduction (dB)")
-    ax.grid(True, alpha=0.3)
-    return legend_above(ax)
+    return labelled(ax, xlabel="Overdrive (dB)", ylabel="Noise reduction (dB)")
 
 
 def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> tuple[Path, Path]:
@@ -406,9 +401,7 @@ def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> 
 
     path = Path(path_without_suffix)
     if path.suffix.lower() in (".png", ".svg"):
-        raise ValueError(
-            f"path_without_suffix must leave out the suffix, because both files are written; got {str(path)!r}"
-        )
+        raise ValueError(f"path_without_suffix must leave out the suffix: both files are written; got {str(path)!r}")
     made_folder(path.parent)
     png, svg = (path.with_name(path.name + suffix) for suffix in (".png", ".svg"))
     with mpl.rc_context({"svg.hashsalt": "kfopc_filterpy"}):
@@ -427,6 +420,4 @@ def _window_in_words(window_s: float) -> str:
 def _over_time(ax: Axes, shown: list[Curve], label: str) -> Axes:
     """Label axes with a quantity over the time of whole runs, and return them."""
     ax.set_xlim(0, max(curve.run.n_samples / curve.run.fs for curve in shown))
-    ax.set(xlabel="Time (s)", ylabel=label)
-    ax.grid(True, alpha=0.3)
-    return legend_above(ax)
+    return labelled(ax, xlabel="Time (s)", ylabel=label)

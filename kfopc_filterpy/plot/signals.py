@@ -11,20 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_band, as_positive, per_channel
+from ..controllers.base import listed
 from ..loop.result import SimulationResult
 from ..metrics import SOUND_PRESSURE, coherence_and_gain, output_power, power_spectrum_db
-from .results import (
-    DISTURBANCE,
-    RATED,
-    Results,
-    curves,
-    one_channel,
-    require_common_disturbance,
-    span_axis,
-    span_of,
-    times,
-)
-from .style import legend_above, new_axes
+from .results import DISTURBANCE, RATED, Results, curves, one_channel, require_common_disturbance, span_of, span_times
+from .style import labelled, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,10 +105,8 @@ def plot_error_spectra(
         # The errors set the depth of the axis: the floor of the disturbance outside its band is of no interest.
         ax.set_ylim(max(np.min(np.concatenate(levels[1:]), initial=top) - 5, top - _DEPTH_DB), top + 5)
     ax.set_xlim(low, high)
-    ax.set_xlabel("Frequency (Hz)")
-    ax.set_ylabel(f"Power per Hz (dB re {unit}/Hz)" if scaling == "density" else f"Power (dB re {unit})")
-    ax.grid(True, alpha=0.3)
-    return legend_above(ax)
+    power = f"Power per Hz (dB re {unit}/Hz)" if scaling == "density" else f"Power (dB re {unit})"
+    return labelled(ax, xlabel="Frequency (Hz)", ylabel=power)
 
 
 def _over_20_micropascal(pascal_per_unit: Any, run: SimulationResult, channel: int | None) -> np.ndarray:
@@ -171,12 +160,11 @@ def plot_anti_noise(
     disturbance = one_channel(run.disturbance, channel)
     waves = [one_channel(curve.run.anti_noise, channel) for curve in shown]
     ax = new_axes(ax)
-    time = times(run, part, span_axis(ax, span_s))
+    time = span_times(ax, run, part, span_s)
     ax.plot(time, disturbance[part], label="Disturbance", **DISTURBANCE)
     for curve, wave in zip(shown, waves, strict=True):
         ax.plot(time, wave[part], **curve.line())
-    ax.set_ylabel("Sound at the error microphone")
-    return legend_above(ax)
+    return labelled(ax, ylabel="Sound at the error microphone")
 
 
 def plot_amplifier_output(
@@ -229,10 +217,9 @@ def plot_amplifier_output(
         for curve, part in zip(shown, parts, strict=True)
     ]
     ax = new_axes(ax)
-    per_second = span_axis(ax, span_s)
     before = []
     for curve, part, (y, out) in zip(shown, parts, signals, strict=True):
-        time = times(curve.run, part, per_second)
+        time = span_times(ax, curve.run, part, span_s)
         ax.plot(time, out, **curve.line())
         if np.any(changed := np.abs(y - out) > _VISIBLE * _peak(out)):
             dashed = {"color": curve.style["color"], "linestyle": (0, (2, 1.5)), "linewidth": 0.9}
@@ -247,8 +234,7 @@ def plot_amplifier_output(
     top = 1.1 * max([*peaks, min(max(before, default=0.0), 2.5 * max(peaks))])
     if top > 0:
         ax.set_ylim(-top, top)
-    ax.set_ylabel("Amplifier output")
-    return legend_above(ax)
+    return labelled(ax, ylabel="Amplifier output")
 
 
 def plot_disturbance_and_anti_noise(
@@ -309,22 +295,16 @@ def plot_disturbance_and_anti_noise(
     coherence, gain = coherence_and_gain(disturbance, anti_noise, run.fs, (low, high))
     text = (
         f"Anti-noise over disturbance, {low:g} to {high:g} Hz: coherence {coherence:.4f}, gain {gain:.3f}\n"
-        f"Output power {_listed(output_power(run.control_signal), '.5g')}"
+        f"Output power {listed(output_power(run.control_signal), '.5g')}"
     )
     if run.rated_power is not None:
-        text += f", rated power {_listed(run.rated_power, 'g')}"
+        text += f", rated power {listed(run.rated_power, 'g')}"
     ax = new_axes(ax)
-    time = times(run, part, span_axis(ax, span_s))
+    time = span_times(ax, run, part, span_s)
     ax.plot(time, disturbance[part], label="Disturbance", **{**DISTURBANCE, "linewidth": 1.6})
     line = shown[0].line()
     ax.plot(time, anti_noise[part], **{**line, "label": f"Anti-noise, {line['label']}"})
-    ax.set_ylabel("Sound at the error microphone")
-    return legend_above(ax, text)
-
-
-def _listed(powers: Any, form: str) -> str:
-    """Return a number, or one for each loudspeaker, as text."""
-    return ", ".join(format(power, form) for power in np.atleast_1d(powers))
+    return labelled(ax, text, ylabel="Sound at the error microphone")
 
 
 def _peak(signal: np.ndarray) -> float:

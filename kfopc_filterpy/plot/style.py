@@ -89,8 +89,8 @@ def line_style(i: int) -> dict[str, Any]:
     return {key: value for key, value in curve_style(i).items() if key != "marker"}
 
 
-def frequency_axis(ax: Axes, frequencies: np.ndarray, label: bool = True) -> None:
-    """Make a logarithmic axis in Hz with ticks at 1, 2 and 5 written out."""
+def frequency_axis(ax: Axes, frequencies: np.ndarray) -> Axes:
+    """Make a logarithmic axis in Hz with ticks at 1, 2 and 5 written out, and return the axes as `labelled` does."""
     from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
     ax.set_xscale("log")
@@ -98,9 +98,7 @@ def frequency_axis(ax: Axes, frequencies: np.ndarray, label: bool = True) -> Non
     ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.xaxis.set_major_formatter(EngFormatter(sep=""))
     ax.xaxis.set_minor_formatter(NullFormatter())
-    ax.grid(True, which="major", alpha=0.3)
-    if label:
-        ax.set_xlabel("Frequency (Hz)")
+    return labelled(ax, xlabel="Frequency (Hz)")
 
 
 def phase_axis(ax: Axes, label: str) -> None:
@@ -112,6 +110,13 @@ def phase_axis(ax: Axes, label: str) -> None:
     step = next((step for step in (15.0, 45.0, 90.0, 180.0) if high - low <= 6 * step), turns)
     ax.yaxis.set_major_locator(MultipleLocator(step))
     ax.set_ylabel(label)
+
+
+def labelled(ax: Axes, title: str | None = None, **labels: str) -> Axes:
+    """Give axes their labels, a grid and a legend with this title, and return them."""
+    ax.set(**labels)
+    ax.grid(True, alpha=0.3)
+    return legend_above(ax, title)
 
 
 def legend_above(ax: Axes, title: str | None = None) -> Axes:

@@ -384,12 +384,11 @@ def _limits(rating: Any) -> OutputLimits:
         return rating
     if isinstance(rating, AmplifierRating | LoudspeakerRating):
         return rating.limits
-    if np.ndim(rating) == 0 and not isinstance(rating, str | bytes):
-        try:
-            return OutputLimits(as_positive(rating, "rating"))
-        except TypeError:
-            pass
-    raise TypeError(f"rating must be a rated power, an AmplifierRating or a LoudspeakerRating, got {rating!r}")
+    try:
+        return OutputLimits(as_positive(rating, "rating"))
+    except TypeError:
+        wanted = "a rated power, an AmplifierRating or a LoudspeakerRating"
+        raise TypeError(f"rating must be {wanted}, got {rating!r}") from None
 
 
 def as_curve(value: float | Sequence[ArrayLike] | np.ndarray, name: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
@@ -401,9 +400,7 @@ def as_curve(value: float | Sequence[ArrayLike] | np.ndarray, name: str, unit: s
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name} must be a number in {unit}, or frequencies in Hz and values in {unit}") from error
     if frequencies.ndim != 1 or frequencies.shape != values.shape or frequencies.size == 0:
-        raise ValueError(
-            f"{name} must have a value for each frequency, got shapes {frequencies.shape} and {values.shape}"
-        )
+        raise ValueError(f"{name} must have a value for each frequency, got {frequencies.shape} and {values.shape}")
     require_finite(frequencies, f"the frequencies of {name}")
     require_finite(values, name)
     if np.any(np.diff(frequencies) <= 0) or frequencies[0] < 0:

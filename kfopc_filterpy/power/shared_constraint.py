@@ -14,6 +14,15 @@ from .._validate import as_nonnegative, as_positive, as_signal, per_loudspeaker
 from .constraint import OutputPowerConstraint
 
 
+def _of_each(name: str, check: Callable[[Any, str], float], description: str) -> Any:
+    """Return a property: an array of a value of each constraint; one number can be assigned for all."""
+
+    def get(own: SharedConstraint) -> np.ndarray:
+        return np.array([getattr(one, name) for one in own], dtype=np.float64)
+
+    return property(get, lambda own, value: own._assign(name, value, check), doc=description)
+
+
 class SharedConstraint(tuple[OutputPowerConstraint, ...]):
     r"""Constraints of J loudspeakers; the smallest of their factors scales the measurements of all microphones.
 
@@ -26,14 +35,13 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
     not the paper's. All properties except `factor` have one value for each loudspeaker, (J,).
     """
 
-    @property
-    def rated_power(self) -> np.ndarray:
-        """Rated powers, (J,); can be assigned, also as one number for all."""
-        return self._of_each("rated_power")
-
-    @rated_power.setter
-    def rated_power(self, value: PerLoudspeaker) -> None:
-        self._assign("rated_power", value, as_positive)
+    rated_power = _of_each("rated_power", as_positive, "Rated powers, (J,); can be assigned.")
+    disturbance_power = _of_each(
+        "disturbance_power", as_nonnegative, "Disturbance powers last used, (J,); can be assigned."
+    )
+    secondary_path_gain = _of_each(
+        "secondary_path_gain", as_positive, "Power gains last used, (J,), NaN if unknown; can be assigned."
+    )
 
     @property
     def factor(self) -> float:
@@ -43,24 +51,6 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
     @factor.setter
     def factor(self, value: float | None) -> None:
         self._assign("factor", value, as_nonnegative)
-
-    @property
-    def disturbance_power(self) -> np.ndarray:
-        """Disturbance powers last used, (J,), which differ only if the memories do; can be assigned."""
-        return self._of_each("disturbance_power")
-
-    @disturbance_power.setter
-    def disturbance_power(self, value: PerLoudspeaker) -> None:
-        self._assign("disturbance_power", value, as_nonnegative)
-
-    @property
-    def secondary_path_gain(self) -> np.ndarray:
-        """Power gains last used, (J,), NaN if unknown; can be assigned."""
-        return self._of_each("secondary_path_gain")
-
-    @secondary_path_gain.setter
-    def secondary_path_gain(self, value: PerLoudspeaker) -> None:
-        self._assign("secondary_path_gain", value, as_positive)
 
     def fresh(self, rated_power: PerLoudspeaker) -> SharedConstraint:
         """Return constraints with the same settings, without samples, for other rated powers."""
@@ -114,9 +104,6 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
             [_sum_of_squares(one, "the newest filtered reference") for one in filtered],
             None if reference is None else _sum_of_squares(reference, "reference"),
         )
-
-    def _of_each(self, name: str) -> np.ndarray:
-        return np.array([getattr(one, name) for one in self], dtype=np.float64)
 
     def _assign(self, name: str, value: Any, check: Callable[[Any, str], float]) -> None:
         values = [None] * len(self) if value is None else per_loudspeaker(value, len(self), name, check)

@@ -196,30 +196,25 @@ class _Session:
         self.block_s = interface.block / interface.fs
         self.blocks = self.overruns = self.lost = 0
         self.load = self.load_since_report = 0.0
-        self._dry_before = self._dry
+        self._dry_before = getattr(interface, "dry", 0)
         self._noted = 0  # underflows that the health record has, or that were before it
-
-    @property
-    def _dry(self) -> int:
-        return int(getattr(self.interface, "dry", 0))
 
     @property
     def underflows(self) -> int:
         """Blocks of this run that came too late for the output."""
-        return self._dry - self._dry_before
+        return int(getattr(self.interface, "dry", 0) - self._dry_before)
 
     def play(self, signal: np.ndarray) -> _Heard:
         """Play a signal (J, n), and return what was heard meanwhile; a value that is not finite becomes 0."""
         heard: list[Any] = []
         size = self.interface.block
-        blocks = -(-signal.shape[1] // size)
-        padded = np.pad(signal, ((0, 0), (0, blocks * size - signal.shape[1])))
-        for b in range(blocks):
+        padded = np.pad(signal, ((0, 0), (0, -signal.shape[1] % size)))
+        for begin in range(0, padded.shape[1], size):
             block = self.interface.read()
             if block is None:
                 break
             heard.append(block)
-            self.interface.write(padded[:, b * size : (b + 1) * size])
+            self.interface.write(padded[:, begin : begin + size])
         if not heard:
             raise FaultError("the interface ended before anything was heard")
         self.lost += sum(block.lost for block in heard)
@@ -233,15 +228,9 @@ class _Session:
         lost, underflows = self.lost, self.underflows
         yield
         lost, underflows = self.lost - lost, self.underflows - underflows
-        if lost:
-            raise FaultError(
-                f"{lost} samples were lost while {task}, so it would be wrong: use longer blocks, or run again"
-            )
-        if underflows:
-            raise FaultError(
-                f"the output ran dry {underflows} time(s) while {task}, so it would be wrong: use longer blocks or more of "
-                "them ahead, or run again"
-            )
+        if lost or underflows:
+            gap = f"{lost} samples were lost" if lost else f"the output ran dry {underflows} time(s)"
+            raise FaultError(f"{gap} while {task}: use longer blocks, or more of them ahead, or run again")
 
     def step(self, supervisor: Supervisor) -> tuple[Any, np.ndarray] | None:
         """Process a block; return it with its control signals, None at the end."""
@@ -341,9 +330,7 @@ def _round_trip(recordings: list[_Heard], longest: int, what: str) -> int:
     arrivals = [_arrival(own.y[j], e, longest) for j, own in enumerate(recordings) for e in own.e]
     clear = [arrival for arrival in arrivals if arrival is not None]
     if not clear:
-        raise FaultError(
-            f"no loudspeaker is heard by any error microphone: check the cables and the channels, or raise {what}"
-        )
+        raise FaultError(f"no loudspeaker is heard by any error microphone: check cables and channels, or raise {what}")
     return min(clear)
 
 
@@ -458,8 +445,7 @@ def run(
     as_positive(report_every_s, "report_every_s", unit="s")
     if seconds is not None:
         as_positive(seconds, "seconds", unit="s")
-    unknown = set(supervision) - set(signature(Supervisor).parameters)
-    if unknown:
+    if unknown := set(supervision) - set(signature(Supervisor).parameters):
         raise TypeError(f"run has no setting {', '.join(sorted(unknown))}, and Supervisor has none either")
     session = _Session(interface)
     identified = None
@@ -471,9 +457,7 @@ def run(
 
     known = {"full_scale": None, "blocks_can_repeat": True}
     settings: dict[str, Any] = {name: getattr(interface, name, value) for name, value in known.items()} | supervision
-    supervised: Callable[[Any], Supervisor] = partial(
-        Supervisor, fs=interface.fs, amplitude_limit=amplitude_limit, **settings
-    )
+    supervised = partial(Supervisor, fs=interface.fs, amplitude_limit=amplitude_limit, **settings)
     supervisor = supervised(made)
     _require_fit(supervisor, interface)
     possible_db = _possible_db(silence, made, interface.fs) if check_causality else np.nan
@@ -700,7 +684,8 @@ def _possible_db(silence: _Heard, controller: Any, fs: float) -> float:
     possible = _best_db(silence, path, n_taps, fs)
     if possible >= WORTH_DB:
         return possible
-    delay = _first_arrival(path)
+    taps = np.abs(np.reshape(path, (-1, np.shape(path)[-1])))
+    delay = int(np.argmax(np.any(taps > DELAY_SHARE * np.max(taps), axis=0)))  # until the first path has arrived
     sooner = _best_db(silence, path[..., delay:], n_taps + delay, fs)
     if sooner < possible + WORTH_DB:
         return possible
@@ -710,12 +695,6 @@ def _possible_db(silence: _Heard, controller: Any, fs: float) -> float:
         f"{sooner:.1f} dB). Use shorter blocks, or move the reference microphone towards the noise: each millisecond "
         "corresponds to 34 cm. To run anyway, set check_causality=False"
     )
-
-
-def _first_arrival(path: Any) -> int:
-    """Return the number of samples before the first path of an array has arrived."""
-    taps = np.abs(np.reshape(path, (-1, np.shape(path)[-1])))
-    return int(np.argmax(np.any(taps > DELAY_SHARE * np.max(taps), axis=0)))
 
 
 def _best_db(silence: _Heard, path: Any, n_taps: int, fs: float) -> float:

@@ -372,7 +372,7 @@ def test_refusals_say_what_was_wrong(tmp_path):
         study(tables=[POWERS, EMPTY, POWERS])
     with pytest.raises(ValueError, match=r"stem must be lower-case letters.*got '../powers'"):
         Table("../powers", "", [], [])
-    with pytest.raises(ValueError, match="rows must have 2 cells, one for each heading, got 1"):
+    with pytest.raises(ValueError, match="rows must have 2 cells, as there are headings, got"):
         Table("powers", "", ["x", "y"], [[1.0]])
     with pytest.raises(ValueError, match=r"algorithms\['KF-ANC'\] holds unknown figures of merit \['loudness'\]"):
         study(algorithms={"KF-ANC": {"loudness": 1.0}})

@@ -15,7 +15,6 @@ from kfopc_filterpy import OutputLimiter
 from kfopc_filterpy.core import building
 from kfopc_filterpy.core.block import Algorithm, Block, Shape, _plan_of
 
-SETTING, SCRATCH = 1, 2  # anc_role
 SHAPES = {
     "one channel": Shape(1, 1, 1, 9, 5),
     "two references": Shape(1, 1, 2, 9, 5),
@@ -30,17 +29,11 @@ MOST_BYTES = 1 << 22  # of a block that is opened
 
 
 class Described(Block):
-    """A block that also knows the roles of its fields."""
-
-    roles: dict[str, int]
-
-    def _keep_field(self, to: Any, name: bytes, role: int, *rest: Any) -> None:
-        self.__dict__.setdefault("roles", {})[name.decode()] = role
-        super()._keep_field(to, name, role, *rest)
+    """A block whose steps are called by their names."""
 
     def kept(self) -> dict[str, bytes]:
         """Return the bytes of all that a refused step must not change."""
-        return {name: field.tobytes() for name, field in self.fields.items() if self.roles[name] != SCRATCH}
+        return {name: field.tobytes() for name, field in self.fields.items() if name not in self.scratch}
 
     def step(self, half: str, signal: np.ndarray) -> int:
         """Call control_signal or update of the algorithm."""
@@ -100,8 +93,8 @@ def test_a_refused_step_changes_nothing(name: str, shape: str) -> None:
 
 def test_roles_are_known() -> None:
     block = made("fxlms", SHAPES["one channel"])
-    assert block.roles["secondary_path"] == SETTING
-    assert set(block.states) == {name for name, role in block.roles.items() if role not in (SETTING, SCRATCH)}
+    assert "weights" in block.states
+    assert not set(block.states) & {"secondary_path", "step_size", *block.scratch}
 
 
 # Plans of any kind.

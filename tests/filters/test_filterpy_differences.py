@@ -133,5 +133,5 @@ def test_a_batch_names_the_step_that_was_refused_and_saves_those_before() -> Non
 
 @pytest.mark.parametrize("R", [2.0, None, [[3.0]]])
 def test_an_R_that_does_not_fit_the_rows_of_H_is_named(R: Any) -> None:
-    with pytest.raises(ValueError, match=r"R must have shape \(2, 2\), a row for each of H, got .* for dim_z = 1"):
+    with pytest.raises(ValueError, match=r"R must have shape \(2, 2\), as H has rows, got .* for dim_z = 1"):
         KFOPC(3, 1).update([1.0, 2.0], R=R, H=np.eye(2, 3))
