@@ -12,42 +12,24 @@ from pathlib import Path
 
 from kfopc_filterpy.bench import Runs, StudyReport, prepare_folder, results_table, write_report
 
-from .studies import (
-    amplifier,
-    broadband,
-    constraint,
-    duct,
-    kf_pb,
-    loss_map,
-    mismatch,
-    multichannel,
-    rated_powers,
-    tonal,
-    tracking,
-    uncertain_path,
-)
-
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
+
+
+def _study(module: str, main: str = "main") -> Study:
+    """Return a function of a study's module that runs it, and the one that counts its runs."""
+    own = import_module(f".studies.{module}", __package__)
+    return getattr(own, main), own.planned_runs
+
+
 SPEED = "speed"
 ALONE = {"sweep": ".sweep.command", "soak": ".soak.study", "board": ".board.study"}  # with options of their own
-STUDIES: dict[str, Study] = {
-    "tonal": (tonal.main, tonal.planned_runs),
-    "broadband": (broadband.main, broadband.planned_runs),
-    "duct": (duct.main, duct.planned_runs),
-    "duct-measured": (duct.main_measured, duct.planned_runs),
-}
-FURTHER: dict[str, Study] = {  # beyond the paper
-    "duct-motor": (duct.main_motor, duct.planned_runs),
-    "constraint": (constraint.main, constraint.planned_runs),
-    "kf_pb": (kf_pb.main, kf_pb.planned_runs),
-    "loss_map": (loss_map.main, loss_map.planned_runs),
-    "rated_powers": (rated_powers.main, rated_powers.planned_runs),
-    "mismatch": (mismatch.main, mismatch.planned_runs),
-    "uncertain_path": (uncertain_path.main, uncertain_path.planned_runs),
-    "tracking": (tracking.main, tracking.planned_runs),
-    "amplifier": (amplifier.main, amplifier.planned_runs),
-    "multichannel": (multichannel.main, multichannel.planned_runs),
-}
+STUDIES = {name: _study(name) for name in ("tonal", "broadband", "duct")}
+STUDIES["duct-measured"] = _study("duct", "main_measured")
+BEYOND_THE_PAPER = (
+    *("constraint", "kf_pb", "loss_map", "rated_powers", "mismatch", "uncertain_path", "tracking", "amplifier"),
+    "multichannel",
+)
+FURTHER = {"duct-motor": _study("duct", "main_motor"), **{name: _study(name) for name in BEYOND_THE_PAPER}}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -436,7 +436,9 @@ def harmonics_db(
     centres = np.round(np.arange(2, 11) * bins_per_harmonic).astype(int)
     centres = centres[centres + _LOBE_BINS <= (n_samples - 1) // 2]
     if centres.size == 0:
-        raise ValueError(f"fundamental_hz must have a second harmonic below {rate / 2:g} Hz, got {fundamental_hz:g} Hz")
+        raise ValueError(
+            f"fundamental_hz must have its second harmonic below fs/2 = {rate / 2:g} Hz, got {fundamental_hz:g}"
+        )
     harmonics = np.sum(_line_powers(e, centres))
     fundamental = _line_powers(d, np.array([round(bins_per_harmonic)]))[0]
     return float(_ratio_db(harmonics, fundamental))

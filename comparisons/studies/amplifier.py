@@ -15,21 +15,9 @@ from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, Stud
 from kfopc_filterpy.metrics import coherence_and_gain, harmonics_db
 from kfopc_filterpy.plot import curve_style
 
+from . import cases
 from . import report_parts as parts
-from .cases import (
-    BAND_HZ,
-    FS,
-    TONE_HZ,
-    Case,
-    Pair,
-    Setting,
-    driven_case,
-    ducts,
-    grids,
-    noise_of,
-    tune_all,
-    with_overdrive,
-)
+from .cases import BAND_HZ, FS, TONE_HZ, Case, Pair, Setting
 from .rows import Row, column, grouped, select, span, worst
 
 PEAK_LIMITED = ("clipping FxLMS", "re-scaling FxLMS", "two-gradient FxLMS")
@@ -79,18 +67,18 @@ class AmplifierRow(Row):
 
 def planned_runs() -> int:
     """Return the number of runs of the study."""
-    tried = {name: len(grid) for name, grid in grids(ALGORITHMS).items()}
+    tried = {name: len(grid) for name, grid in cases.grids(ALGORITHMS).items()}
     tried |= dict.fromkeys(PEAK_LIMITED, len(STEP_SIZES) * len(LIMIT_SHARES))
     of_a_case = sum(tried[name] + 1 for name in [*ALGORITHMS, *knowing()])
-    return len(cases(list(ducts()))) * len(OVERDRIVES_DB) * of_a_case
+    return len(all_cases(list(cases.ducts()))) * len(OVERDRIVES_DB) * of_a_case
 
 
 def main(runs: Runs) -> StudyReport:
     """Run the study on all ducts at hand."""
-    pairs = ducts()
+    pairs = cases.ducts()
     rows: list[AmplifierRow] = []
     tuned = {}
-    for case in cases(list(pairs)):
+    for case in all_cases(list(pairs)):
         own, best = run_case(runs, case, pairs[case.path])
         rows += own
         tuned[f"{case}, {case.amplifier}"] = {at: parts.tuned_in_words(one) for at, one in best.items()}
@@ -107,12 +95,9 @@ def main(runs: Runs) -> StudyReport:
         parameters=parts.driven_parameters(DURATION_S, list(OVERDRIVES_DB))
         | {
             "amplitude_limits": Parameter(
-                list(LIMIT_SHARES),
-                "A^2 of the peak-limited algorithms over the amplifier's: up to the amplifier's own; tuned with the step size",
+                list(LIMIT_SHARES), "A^2 of the peak-limited algorithms over the amplifier's"
             ),
-            "overrun": Parameter(
-                OVERRUN, "power that the last weights ask for over what cancels the noise with a linear amplifier"
-            ),
+            "overrun": Parameter(OVERRUN, "power that the last weights ask for over what cancels the noise"),
             "settings": Parameter(tuned, "best and tried at each overdrive, without and with the amplifier known"),
         },
         extra={"rows": [asdict(row) for row in rows]},
@@ -127,7 +112,7 @@ def main(runs: Runs) -> StudyReport:
 # ---- Runs
 
 
-def cases(names: Sequence[str]) -> list[Case]:
+def all_cases(names: Sequence[str]) -> list[Case]:
     """Return both amplifiers on the first paths, and the hard clip on the others."""
     return [
         Case(path, noise, amplifier)
@@ -146,7 +131,7 @@ def settings_for(scene: Scene, algorithms: Sequence[str]) -> dict[str, list[Sett
     """
     limit = scene.amplitude_limit**2 / scene.unconstrained_power
     peaks: list[Setting] = [(mu, share * limit) for mu in STEP_SIZES for share in LIMIT_SHARES]
-    return {name: peaks if name in PEAK_LIMITED else own for name, own in grids(algorithms).items()}
+    return {name: peaks if name in PEAK_LIMITED else own for name, own in cases.grids(algorithms).items()}
 
 
 def knowing() -> list[str]:
@@ -156,20 +141,20 @@ def knowing() -> list[str]:
 
 def saturating(scene: Scene, case: Case, overdrive_db: float, known: str) -> Scene:
     """Return the scene at an overdrive, with an amplifier that puts out sqrt(2 rated power) at most."""
-    driven = with_overdrive(scene, overdrive_db)
+    driven = cases.with_overdrive(scene, overdrive_db)
     amplifier = AMPLIFIERS[case.amplifier](driven.amplitude_limit)
     return replace(driven, amplifier=amplifier, known_amplifier=amplifier if known == KNOWN else None)
 
 
 def run_case(runs: Runs, case: Case, pair: Pair) -> tuple[list[AmplifierRow], dict[str, dict[str, Tuned | None]]]:
     """Return every algorithm at every overdrive, tuned there; those that can know the amplifier without and with it."""
-    scene = driven_case(pair, noise_of(case.noise, DURATION_S), 0.0)
+    scene = cases.driven_case(pair, cases.noise_of(case.noise, DURATION_S), 0.0)
     rows: list[AmplifierRow] = []
     best = {}
     for overdrive, known in product(OVERDRIVES_DB, (UNKNOWN, KNOWN)):
         names = list(ALGORITHMS) if known == UNKNOWN else knowing()
         driven = saturating(scene, case, overdrive, known)
-        tuned = tune_all(runs, driven, settings_for(driven, names))
+        tuned = cases.tune_all(runs, driven, settings_for(driven, names))
         best[f"{overdrive:g} dB, {known}"] = tuned
         rows += runs.map(partial(_run, driven, case, tuned, overdrive, known), names)
     return rows, best

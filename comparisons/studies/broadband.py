@@ -67,9 +67,8 @@ def main(runs: Runs) -> StudyReport:
     powers = {name: [output_power(r.control_signal) for r in rows] for name, rows in results.items()}
     first = results["KF-OPC"][0]
     coherence = coherence_and_gain(first.disturbance, first.anti_noise, FS, BAND)
-    times, reductions = (
-        {name: own[figure] for name, own in merits.items()} for figure in ("convergence_time_s", "noise_reduction_db")
-    )
+    shown = ("convergence_time_s", "noise_reduction_db")
+    times, reductions = ({name: own[figure] for name, own in merits.items()} for figure in shown)
     return StudyReport(
         name="broadband",
         title="Broadband noise and a linear amplifier",
@@ -88,8 +87,7 @@ def main(runs: Runs) -> StudyReport:
             "amplifier": Parameter("linear", "see the summary"),
             "measurement_noise_q with clipping": Parameter(
                 clipped_scene.measurement_noise,
-                "estimate of eq. 7: to the q above comes what no control filter explains of the part that the amplifier "
-                "clips off the best control signal of rated power; the settings tuned, r E[x'^2]/q among them, are kept",
+                "the q above, and what no filter explains of what the amplifier clips off the best signal of rated power",
             ),
         }
         | parts.BANDPASS_PATHS,
@@ -118,15 +116,10 @@ def main(runs: Runs) -> StudyReport:
 
 
 def _scene(n_taps: int) -> Scene:
-    return bench.make_scene(
-        {seed: band_limited_noise(BAND, DURATION_S, fs=FS, rng=seed) for seed in SEEDS},
-        bandpass_path(128, fs=FS),
-        bandpass_path(32, fs=FS),
-        fs=FS,
-        rated_power=RATED_POWER,
-        power_multiple=POWER_MULTIPLE,
-        n_taps=n_taps,
-    )
+    noises = {seed: band_limited_noise(BAND, DURATION_S, fs=FS, rng=seed) for seed in SEEDS}
+    paths = (bandpass_path(n, fs=FS) for n in (128, 32))
+    powers: dict[str, Any] = {"rated_power": RATED_POWER, "power_multiple": POWER_MULTIPLE}
+    return bench.make_scene(noises, *paths, fs=FS, n_taps=n_taps, **powers)
 
 
 # ---- Runs

@@ -9,28 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import (
-    SimulationResult,
-    bandpass_path,
-    power_constrained_wiener,
-)
+from kfopc_filterpy import SimulationResult, bandpass_path, power_constrained_wiener, signals
 from kfopc_filterpy._types import ChangingPaths
 from kfopc_filterpy.bench import Runs, Scene, Tuned, algorithms, best_setting, make_controller, make_scene, try_settings
 from kfopc_filterpy.bench.scene import louder, reachable_weights
 from kfopc_filterpy.bounds import PowerConstrainedWiener
 from kfopc_filterpy.loop.inputs import disturbance_at_microphone, noise_gain
 from kfopc_filterpy.paths import duct_paths, path_taps
-from kfopc_filterpy.signals import (
-    DataUnavailableError,
-    MeasuredDuct,
-    band_limited_noise,
-    bursty_noise,
-    compressor_noise,
-    load_measured_duct,
-    looped,
-    swelling,
-    tone,
-)
+from kfopc_filterpy.signals import MeasuredDuct
 
 FS = 16000.0
 SWITCH_ON_S = 0.5
@@ -66,6 +52,11 @@ class Case:
         """Whether every second of the noise is as loud as the others."""
         return self.noise in STATIONARY
 
+    @property
+    def place(self) -> dict[str, Any]:
+        """Paths and noise, as rows of results have them."""
+        return {"path": self.path, "noise": self.noise}
+
     def __str__(self) -> str:
         return f"{self.path}, {self.noise}"
 
@@ -84,11 +75,8 @@ def modelled_paths() -> dict[str, Pair]:
 
 def paths() -> dict[str, Pair]:
     """Return primary and secondary taps by name, with the measured duct if it is at hand."""
-    pairs = modelled_paths()
     measured = measured_data()
-    if measured is not None:
-        pairs["measured duct"] = of_unit_gain(measured)
-    return pairs
+    return modelled_paths() | ({} if measured is None else {"measured duct": of_unit_gain(measured)})
 
 
 def of_unit_gain(measured: MeasuredDuct) -> Pair:
@@ -106,17 +94,17 @@ def made_noises(band_hz: tuple[float, float] = WIDE_BAND_HZ) -> dict[str, Noise]
     """Return the noises that are made and not recorded, by name."""
 
     def band_noise(duration: float, seed: int) -> np.ndarray:
-        return band_limited_noise(band_hz, duration, fs=FS, rng=seed)
+        return signals.band_limited_noise(band_hz, duration, fs=FS, rng=seed)
 
     def swelling_band_noise(duration: float, seed: int) -> np.ndarray:
         steady = band_noise(duration, seed)
-        return swelling(steady, fs=FS, swing_db=SWING_DB, period_s=PERIOD_S, phase_rad=float(seed))
+        return signals.swelling(steady, fs=FS, swing_db=SWING_DB, period_s=PERIOD_S, phase_rad=float(seed))
 
     return {
-        "tone": lambda duration, seed: tone(TONE_HZ, duration, fs=FS, phase_rad=float(seed)),
-        "compressor": lambda duration, seed: compressor_noise(duration, fs=FS, rng=seed),
+        "tone": lambda duration, seed: signals.tone(TONE_HZ, duration, fs=FS, phase_rad=float(seed)),
+        "compressor": lambda duration, seed: signals.compressor_noise(duration, fs=FS, rng=seed),
         "band noise": band_noise,
-        "bursts": lambda duration, seed: bursty_noise(duration, fs=FS, rng=seed),
+        "bursts": lambda duration, seed: signals.bursty_noise(duration, fs=FS, rng=seed),
         "swelling band noise": swelling_band_noise,
     }
 
@@ -127,7 +115,7 @@ def noises() -> dict[str, Noise]:
     measured = measured_data()
     if measured is not None:
         recording = measured.noise - measured.noise.mean()
-        made["motor"] = lambda duration, seed: looped(recording, duration, fs=FS, start_s=2.5 * seed)
+        made["motor"] = lambda duration, seed: signals.looped(recording, duration, fs=FS, start_s=2.5 * seed)
     return made
 
 
@@ -135,8 +123,8 @@ def noises() -> dict[str, Noise]:
 def measured_data() -> MeasuredDuct | None:
     """Return the measured duct and the motor recording, or None if they cannot be had."""
     try:
-        return load_measured_duct(noise="motor", allow_download=True)
-    except DataUnavailableError:
+        return signals.load_measured_duct(noise="motor", allow_download=True)
+    except signals.DataUnavailableError:
         return None
 
 
@@ -151,17 +139,8 @@ def make_case(
     That power is of the filter with which a Kalman filter without state noise would end, ``(R_x' + q/(N P0) I) w = r``
     over the record. Without the ridge, directions that the noise hardly excites could ask for any power.
     """
-    scene = make_scene(
-        {seed: noise},
-        *pair,
-        fs=FS,
-        rated_power=1.0,
-        power_multiple=1.0,
-        n_taps=n_taps,
-        switch_on_s=SWITCH_ON_S,
-        sensor_noise_db=sensor_noise_db,
-        nse_window_s=0.05,
-    )
+    own: dict[str, Any] = {"n_taps": n_taps, "sensor_noise_db": sensor_noise_db, "switch_on_s": SWITCH_ON_S}
+    scene = make_scene({seed: noise}, *pair, fs=FS, rated_power=1.0, power_multiple=1.0, nse_window_s=0.05, **own)
     normal = louder(scene, 1.0 / np.sqrt(bound_of(scene).unconstrained.control_power))
     return replace(normal, unconstrained_power=1.0)
 
@@ -191,17 +170,9 @@ def bound_of(scene: Scene, segment_s: float = 1.0) -> PowerConstrainedWiener:
     """Return the power-constrained Wiener solutions of a case, of weights that controllers reach."""
     ridge = scene.measurement_noise / (scene.settled[0].shape[-1] * scene.initial_variance)
     with reachable_weights():
-        return power_constrained_wiener(
-            scene.references[0],
-            scene.disturbances[0],
-            scene.secondary,
-            scene.n_taps,
-            scene.rated_power,
-            fs=scene.fs,
-            segment_s=segment_s,
-            switch_on_s=scene.switch_on_s,
-            ridge=ridge,
-        )
+        plant = scene.references[0], scene.disturbances[0], scene.secondary, scene.n_taps, scene.rated_power
+        times: dict[str, Any] = {"fs": scene.fs, "segment_s": segment_s, "switch_on_s": scene.switch_on_s}
+        return power_constrained_wiener(*plant, **times, ridge=ridge)
 
 
 def bounds_db(scene: Scene, stationary: bool) -> tuple[float, float]:

@@ -84,17 +84,18 @@ def main(runs: Runs) -> StudyReport:
     for case in everything:
         own = bench.tune(runs, first(case), TUNED)
         tuned[case] = own | {name: own[other] for name, other in SHARED.items()}
+
+    def times(case: Case) -> dict[str, float]:
+        return convergence_times([scene(case, DURATIONS_S[0], seed) for seed in SEEDS], tuned[case])
+
+    def amplified(case: Case) -> list[ClippedRow]:
+        return run_amplifiers(first(case), pairs[case.path][0], case, tuned[case])
+
     jobs = list(product(everything, DURATIONS_S, SEEDS))
     rows = list(chain(*runs.map(lambda job: run_case(scene(*job), *job, tuned[job[0]]), jobs)))
     stationary = [case for case in everything if case.stationary]
-    times = runs.map(
-        lambda case: convergence_times([scene(case, DURATIONS_S[0], seed) for seed in SEEDS], tuned[case]), stationary
-    )
-    settled = dict(zip(map(str, stationary), times, strict=True))
-    clipping = [Case(*names) for names in product(pairs, CLIPPED_NOISES)]
-    clipped = list(
-        chain(*runs.map(lambda case: run_amplifiers(first(case), pairs[case.path][0], case, tuned[case]), clipping))
-    )
+    settled = dict(zip(map(str, stationary), runs.map(times, stationary), strict=True))
+    clipped = list(chain(*runs.map(amplified, [Case(*names) for names in product(pairs, CLIPPED_NOISES)])))
     return StudyReport(
         name="constraint",
         title="The constraint that holds",
@@ -146,8 +147,8 @@ def run_case(scene: Scene, case: Case, duration_s: float, seed: int, tuned: Sett
     rows: list[ConstraintRow] = []
     for share in SHARES:
         rated = replace(scene, rated_power=share)
-        place: dict[str, Any] = {"path": case.path, "noise": case.noise, "share": share, "seed": seed}
-        place |= {"duration_s": duration_s, "bound_db": cases.bounds_db(rated, case.stationary)[0]}
+        place = case.place | {"share": share, "seed": seed, "duration_s": duration_s}
+        place["bound_db"], _ = cases.bounds_db(rated, case.stationary)
         for name in (*TUNED, *LIMITED):
             figures = figures_of(rated.run(_controller(rated, name, tuned)), share)
             rows.append(ConstraintRow(**place, algorithm=name, setting=tuned[name].setting, **figures))
@@ -185,9 +186,8 @@ def run_amplifiers(scene: Scene, primary: np.ndarray, case: Case, tuned: Setting
     for name in LIMITED:
         jobs.append((clipping, name, "path 6 dB, 45° off", _controller(wrong, name, tuned)))
         jobs.append((jumping, name, f"{JUMP_DB:g} dB louder for a second", _controller(scene, name, tuned)))
-    place: dict[str, Any] = {"path": case.path, "noise": case.noise}
     return [
-        ClippedRow(**place, algorithm=name, known=words, **figures_of(at.run(controller), scene.rated_power))
+        ClippedRow(**case.place, algorithm=name, known=words, **figures_of(at.run(controller), scene.rated_power))
         for at, name, words, controller in jobs
     ]
 
@@ -270,11 +270,8 @@ def _summary_table(rows: Sequence[ConstraintRow]) -> Table:
     longest = max(row.duration_s for row in rows)
     lines: list[list[str | float]] = []
     for name, kind in product((*TUNED, *LIMITED), ("stationary", "varying")):
-        own = [
-            row
-            for row in select(rows, algorithm=name, duration_s=longest)
-            if row.case.stationary == (kind == "stationary")
-        ]
+        own = select(rows, algorithm=name, duration_s=longest)
+        own = [row for row in own if row.case.stationary == (kind == "stationary")]
         losses, powers = column(own, "loss_db"), column(own, "power")
         spent, window = f"{powers.min():.2f}-{powers.max():.2f}", column(own, "worst_window").max()
         lines.append([name, kind, len(own), spent, losses.mean(), losses.max(), window])

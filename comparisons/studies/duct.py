@@ -57,9 +57,7 @@ def main(runs: Runs) -> StudyReport:
     parameters = {
         "noise": Parameter("fluctuating shaft harmonics and broadband noise, as of a compressor", "seeded stand-in"),
         "primary_path": Parameter(f"modelled duct, {duct.model.length_m:g} m", "defaults of duct_paths"),
-        "secondary_path": Parameter(
-            f"modelled duct, loudspeaker at {duct.model.loudspeaker_m:g} m", "defaults of duct_paths"
-        ),
+        "secondary_path": Parameter(f"loudspeaker at {duct.model.loudspeaker_m:g} m", "defaults of duct_paths"),
     }
     noise = compressor_noise(DURATION_S, fs=FS, rng=SEED)
     return _study(runs, "duct", "Machine noise in a modelled duct", noise, (duct.primary, duct.secondary), parameters)
@@ -89,7 +87,7 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
         "noise": Parameter(f"recorded {noise} noise, mean removed", chosen),
         "primary_path": Parameter(f"measured duct, {data.primary.size} taps", "as published, scale arbitrary"),
         "secondary_path": Parameter(
-            f"measured duct, {data.secondary.size} taps, scaled to unit gain for white noise", "scale arbitrary"
+            f"measured duct, {data.secondary.size} taps", "scaled to unit gain for white noise"
         ),
     }
     title = f"Recorded {noise} noise in a measured duct"
@@ -99,15 +97,8 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
 def _study(
     runs: Runs, name: str, title: str, noise: np.ndarray, paths: tuple[Any, ...], parameters: dict[str, Parameter]
 ) -> StudyReport:
-    scene = bench.make_scene(
-        {SEED: noise},
-        *paths,
-        fs=FS,
-        rated_power=RATED_POWER,
-        power_multiple=POWER_MULTIPLE,
-        n_taps=N_TAPS,
-        nse_window_s=NSE_WINDOW_S,
-    )
+    own: dict[str, Any] = {"rated_power": RATED_POWER, "power_multiple": POWER_MULTIPLE, "nse_window_s": NSE_WINDOW_S}
+    scene = bench.make_scene({SEED: noise}, *paths, fs=FS, n_taps=N_TAPS, **own)
     tuned = bench.tune(runs, scene, ALGORITHMS)
     smaller = replace(scene, rated_power=scene.unconstrained_power / OTHER_MULTIPLE)
 

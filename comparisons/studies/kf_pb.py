@@ -101,9 +101,7 @@ def main(runs: Runs) -> StudyReport:
         parameters={
             "n_taps": Parameter(cases.N_TAPS, "of every algorithm and of the bound"),
             "duration_s": Parameter([cases.SILENT_S, cases.DURATION_S], "before and after the control is switched on"),
-            "rated_shares": Parameter(
-                list(cases.SHARES), "of the power that full control needs; the faults have the first"
-            ),
+            "rated_shares": Parameter(list(cases.SHARES), "of the power for full control; the faults have the first"),
             "mov_steps": Parameter(list(STEPS), "over the step that is about the largest stable one"),
             "mov_penalties": Parameter(list(PENALTIES), "over the gain of the path, and the one that adapts"),
             "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "over the disturbance"),

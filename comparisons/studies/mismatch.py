@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import bench
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, algorithms
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
 
@@ -90,9 +90,7 @@ def main(runs: Runs) -> StudyReport:
         parameters=parts.driven_parameters(DURATION_S, OVERDRIVE_DB)
         | {
             "mismatch": Parameter({kind: list(own) for kind, own in AMOUNTS.items()}, "degrees, dB and samples"),
-            "settings": Parameter(
-                tuned, "best and tried at each mismatch, relative to the known path's filtered reference"
-            ),
+            "settings": Parameter(tuned, "best and tried at each mismatch, over the known path's filtered reference"),
         },
         extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
@@ -102,24 +100,13 @@ def main(runs: Runs) -> StudyReport:
             "A tone can stay in control somewhat past 90 degrees, which is the bound of small step sizes.",
             f"A delay of {FS / (2 * sum(BAND_HZ)):.1f} samples turns the middle of the band by 90 degrees, one of "
             f"{FS / (4 * BAND_HZ[1]):.0f} its upper edge.",
-            "There is one seed and one record for each case: differences of some tenths of a dB between algorithms mean "
-            "nothing.",
+            "There is one seed and one record for each case: differences of some tenths of a dB mean nothing.",
             parts.ceilings_note(scenes),
         ],
         tables=[
-            figure_table(
-                stem,
-                f"{caption}, at the settings that are best with the {tuned_with}",
-                select(rows, tuned_with=tuned_with),
-                figure,
-                {"paths": "path", "noise": "noise", "mismatch": "point"},
-                ALGORITHMS,
-            )
-            for stem, caption, tuned_with, figure in (
-                ("exact", "Noise reduction over the steady half in dB", EXACT, "noise_reduction_db"),
-                ("wrong", "Noise reduction over the steady half in dB", WRONG, "noise_reduction_db"),
-                ("power", "Output power over the rated one", EXACT, "power"),
-            )
+            _table(rows, "exact", "Noise reduction over the steady half in dB", EXACT, "noise_reduction_db"),
+            _table(rows, "wrong", "Noise reduction over the steady half in dB", WRONG, "noise_reduction_db"),
+            _table(rows, "power", "Output power over the rated one", EXACT, "power"),
         ],
         claims_heading="Findings",
     )
@@ -176,20 +163,10 @@ def run_case(
             for tuned_with, tuned in ((EXACT, best["phase", 0.0][name]), (WRONG, best[point][name])):
                 # If it diverged at every setting, any of them will do.
                 trial = trials[tuned.setting if tuned else algorithms()[name].grid[0]]
-                figures: dict[str, Any] = {
-                    "setting": trial.setting,
-                    "noise_reduction_db": trial.noise_reduction_db,
-                    "power": np.nan if trial.diverged else trial.output_power / scene.rated_power,
-                    "diverged_at_s": trial.diverged_at_s,
-                }
-                place: dict[str, Any] = {
-                    "path": case.path,
-                    "noise": case.noise,
-                    "kind": kind,
-                    "amount": amount,
-                    "algorithm": name,
-                }
-                rows.append(MismatchRow(**place, tuned_with=tuned_with, **figures))
+                own = {key: getattr(trial, key) for key in ("setting", "noise_reduction_db", "diverged_at_s")}
+                own |= {"power": np.nan if trial.diverged else trial.output_power / scene.rated_power}
+                own |= {"kind": kind, "amount": amount, "algorithm": name, "tuned_with": tuned_with}
+                rows.append(MismatchRow(**case.place, **own))
     return rows, best
 
 
@@ -254,7 +231,12 @@ def _power(rows: Sequence[MismatchRow]) -> Claim:
     )
 
 
-# ---- Figures
+# ---- Tables and figures
+
+
+def _table(rows: Sequence[MismatchRow], stem: str, caption: str, tuned_with: str, figure: str) -> Table:
+    caption, keys = f"{caption}, tuned with the {tuned_with}", {"paths": "path", "noise": "noise", "mismatch": "point"}
+    return figure_table(stem, caption, select(rows, tuned_with=tuned_with), figure, keys, ALGORITHMS)
 
 
 def _figure(rows: Sequence[MismatchRow], case: Case) -> FigureItem:

@@ -280,9 +280,7 @@ def _parameters(tuned: Mapping[str, Mapping[str, Tuned]]) -> dict[str, Parameter
         "fs_hz": Parameter({name: place.fs for name, place in places().items()}, "the measured room's own"),
         "n_taps": Parameter({name: place.n_taps for name, place in places().items()}, "of each control filter"),
         "duration_s": Parameter([DURATION_S, RECORDED_S], "from switch-on, of steady noises and of recordings"),
-        "rated_power": Parameter(
-            rooms.RATED_SHARE, "of the power that each loudspeaker uses without a limit: (R_x' + q/(N P0) I) w = r"
-        ),
+        "rated_power": Parameter(rooms.RATED_SHARE, "of each loudspeaker's without a limit: (R_x' + q/(N P0) I) w = r"),
         "switch_on_s": Parameter(SWITCH_ON_S, "for which the noise runs before the control"),
         "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "below the disturbance"),
         "room_m": Parameter(list(rooms.SIZE_M), f"built-in room, T60 {rooms.REVERBERATION_S:g} s by Sabine's formula"),

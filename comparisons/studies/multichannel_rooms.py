@@ -11,18 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.signal import fftconvolve
 
-from kfopc_filterpy import SimulationResult
+from kfopc_filterpy import SimulationResult, signals
 from kfopc_filterpy.bench import FigureItem, Scene, make_scene
 from kfopc_filterpy.paths import RoomPaths, horizontal_plane, room_paths
-from kfopc_filterpy.signals import (
-    DataUnavailableError,
-    band_limited_noise,
-    compressor_noise,
-    load_measured_duct,
-    load_measured_room,
-    looped,
-    tone,
-)
 
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of
 from .report_parts import new_figure
@@ -87,19 +78,15 @@ def places() -> dict[str, Place]:
 
 def _measured_place() -> Place | None:
     try:
-        room = load_measured_room(allow_download=True)
-        recordings = [load_measured_duct(noise=name.split()[1], allow_download=True).noise for name in RECORDINGS]
-    except DataUnavailableError:
+        room = signals.load_measured_room(allow_download=True)
+        ducts = [signals.load_measured_duct(noise=name.split()[1], allow_download=True) for name in RECORDINGS]
+    except signals.DataUnavailableError:
         return None
     noises = _noises(room.fs, WIDE_BAND_HZ)
     del noises["compressor"]  # the recorded one takes its place
-    for name, recording in zip(RECORDINGS, recordings, strict=True):
-        noises[name] = partial(_from_recording, recording - recording.mean(), room.fs)
+    for name, duct in zip(RECORDINGS, ducts, strict=True):
+        noises[name] = partial(signals.looped, duct.noise - duct.noise.mean(), fs=room.fs)
     return Place(MEASURED, room.fs, MEASURED_N_TAPS, room.primary, room.secondary, noises)
-
-
-def _from_recording(recording: np.ndarray, fs: float, duration_s: float) -> np.ndarray:
-    return looped(recording, duration_s, fs=fs)
 
 
 def _noises(fs: float, band_hz: tuple[float, float]) -> dict[str, Callable[[float], np.ndarray]]:
@@ -109,10 +96,10 @@ def _noises(fs: float, band_hz: tuple[float, float]) -> dict[str, Callable[[floa
     """
 
     def tones(duration: float) -> np.ndarray:
-        return np.sum([tone(f, duration, fs=fs, phase_rad=f) for f in TONES_HZ], axis=0)
+        return np.sum([signals.tone(f, duration, fs=fs, phase_rad=f) for f in TONES_HZ], axis=0)
 
     def band_noise(duration: float) -> np.ndarray:
-        return band_limited_noise(band_hz, duration, fs=fs, rng=SEED)
+        return signals.band_limited_noise(band_hz, duration, fs=fs, rng=SEED)
 
     def over_floor(noise: Callable[[float], np.ndarray], duration: float) -> np.ndarray:
         x = noise(duration)
@@ -122,25 +109,16 @@ def _noises(fs: float, band_hz: tuple[float, float]) -> dict[str, Callable[[floa
     return {
         "tones": partial(over_floor, tones),
         "band noise": partial(over_floor, band_noise),
-        "compressor": lambda duration: compressor_noise(duration, fs=fs, rng=SEED),
+        "compressor": lambda duration: signals.compressor_noise(duration, fs=fs, rng=SEED),
     }
 
 
 def make_rated_scene(place: Place, noise: str, duration_s: float) -> Scene:
     """Return the scene of a noise; each loudspeaker is rated at a quarter of the power that it would use unlimited."""
     x = place.noises[noise](duration_s + SWITCH_ON_S)
-    scene = make_scene(
-        {SEED: x[np.newaxis]},
-        place.primary,
-        place.secondary,
-        fs=place.fs,
-        rated_power=1.0,
-        power_multiple=1.0,
-        n_taps=place.n_taps,
-        switch_on_s=SWITCH_ON_S,
-        sensor_noise_db=SENSOR_NOISE_DB,
-        nse_window_s=0.05,
-    )
+    own: dict[str, Any] = {"n_taps": place.n_taps, "sensor_noise_db": SENSOR_NOISE_DB, "switch_on_s": SWITCH_ON_S}
+    own |= {"fs": place.fs, "rated_power": 1.0, "power_multiple": 1.0, "nse_window_s": 0.05}
+    scene = make_scene({SEED: x[np.newaxis]}, place.primary, place.secondary, **own)
     free = replace(scene, rated_power=1e12)
     wanted = bound_of(free, segment_s=2 * duration_s).unconstrained.control_power
     return replace(scene, rated_power=RATED_SHARE * wanted, unconstrained_power=wanted)

@@ -30,12 +30,8 @@ BOUND, RECORD, SCALED = "bound", "bound of the record", "scaled Wiener"  # the f
 PANELS = {
     "Kalman filters": ("KF-OPC", "KF-OPC repaired", "KF-PB", "diagonal KF-OPC"),
     "FxLMS with a price": (
-        "leaky FxLMS",
-        "optimal leaky FxLMS",
-        "MOV-FxLMS fixed",
-        "MOV-FxLMS by variance",
-        "MOV-FxLMS",
-        "MOV-MFxLMS",
+        *("leaky FxLMS", "optimal leaky FxLMS"),
+        *("MOV-FxLMS fixed", "MOV-FxLMS by variance", "MOV-FxLMS", "MOV-MFxLMS"),
     ),
     "FxLMS with an amplitude limit": ("two-gradient FxLMS", "re-scaling FxLMS", "clipping FxLMS"),
 }
@@ -110,10 +106,8 @@ def _rated(scene: Scene, share_db: float) -> Scene:
 
 def _joined(scenes: Sequence[Scene]) -> Scene:
     """Return one scene with the noises of several."""
-    references, disturbances = (
-        [getattr(scene, name)[0] for scene in scenes] for name in ("references", "disturbances")
-    )
-    return replace(scenes[0], references=references, disturbances=disturbances, seeds=list(SEEDS))
+    joined: Any = {name: [getattr(scene, name)[0] for scene in scenes] for name in ("references", "disturbances")}
+    return replace(scenes[0], **joined, seeds=list(SEEDS))
 
 
 def _tune(runs: Runs, scene: Scene) -> TunedAt:
@@ -137,9 +131,8 @@ def _measure(runs: Runs, case: Case, scenes: Mapping[int, Scene], joined: Scene,
         return bench.run_setting(_rated(joined, share_db), name, setting, joined.seeds.index(seed))
 
     def row(seed: int, share_db: float, name: str, result: SimulationResult | None) -> BudgetRow:
-        place: dict[str, Any] = {"path": case.path, "noise": case.noise, "share_db": share_db, "seed": seed}
-        figures = figures_of(result, 10 ** (share_db / 10))
-        return BudgetRow(**place, algorithm=name, setting=tuned[share_db][name].setting, **figures)
+        own = case.place | {"share_db": share_db, "seed": seed, "setting": tuned[share_db][name].setting}
+        return BudgetRow(**own, algorithm=name, **figures_of(result, 10 ** (share_db / 10)))
 
     def job(at: tuple[int, float | None]) -> list[BudgetRow]:
         seed, share_db = at
@@ -156,12 +149,11 @@ def _measure(runs: Runs, case: Case, scenes: Mapping[int, Scene], joined: Scene,
 
 
 def _bounds(case: Case, scene: Scene, seed: int, share_db: float) -> list[BudgetRow]:
-    place: dict[str, Any] = {"path": case.path, "noise": case.noise, "share_db": share_db, "seed": seed}
-    power = min(1.0 / scene.rated_power, 1.0)
+    place = case.place | {"share_db": share_db, "seed": seed, "power": min(1.0 / scene.rated_power, 1.0)}
     bound, scaled = bounds_db(scene, case.stationary)
     record = bound if case.stationary else bounds_db(scene, True)[0]
     return [
-        BudgetRow(**place, algorithm=label, noise_reduction_db=reached, power=power)
+        BudgetRow(**place, algorithm=label, noise_reduction_db=reached)
         for label, reached in ((BOUND, bound), (RECORD, record), (SCALED, scaled))
     ]
 
@@ -172,9 +164,9 @@ def _bounds(case: Case, scene: Scene, seed: int, share_db: float) -> list[Budget
 def mean_rows(rows: Sequence[BudgetRow]) -> Means:
     """Return means over seeds by case and algorithm, in the order of the rated power; of windows the worst."""
     means: dict[tuple[Case, str], list[BudgetRow]] = {}
-    for (case, name, _), own in sorted(
-        grouped(rows, "case", "algorithm", "share_db").items(), key=lambda item: item[0][2]
-    ):
+    for (case, name, _), own in grouped(
+        sorted(rows, key=lambda row: row.share_db), "case", "algorithm", "share_db"
+    ).items():
         mean: dict[str, Any] = {figure: float(column(own, figure).mean()) for figure in ("noise_reduction_db", "power")}
         row = replace(own[0], **mean, worst_window=float(column(own, "worst_window").max()))
         means.setdefault((case, name), []).append(row)
@@ -194,9 +186,7 @@ def _claims(means: Means) -> list[Claim]:
             bool(np.max(powers) <= Tuned.BUDGET),
             f"{span(powers, '.3f')} of it",
         ),
-        loss_claim(
-            "KF-PB reaches the bound to within 1 dB at every rated power and in every case", 1.0, losses, " below it"
-        ),
+        loss_claim("KF-PB reaches the bound to within 1 dB at every rated power, everywhere", 1.0, losses, " below it"),
         Claim(
             "No other method that keeps the budget reduces the noise by more than 0.3 dB more than KF-PB",
             most_behind <= 0.3,
@@ -271,9 +261,7 @@ def _parameters(tuned: Mapping[Case, TunedAt]) -> dict[str, Parameter]:
         "duration_s": Parameter(DURATION_S, "from switch-on on; the steady half counts"),
         "rated_power_db": Parameter(list(SHARES_DB), "over the unconstrained control power of each noise"),
         "seeds": Parameter(list(SEEDS), "of noise; of the recording, where it begins; tuned on all of them"),
-        "settings": Parameter(
-            settings, f"best and tried at each rated power; for two settings a finer grid follows; {Tuned.RULE}"
-        ),
+        "settings": Parameter(settings, f"best and tried; for two settings a finer grid follows; {Tuned.RULE}"),
     }
 
 

@@ -85,28 +85,16 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
         "rated_power": Parameter(scene.rated_power, "the paper's"),
         "n_taps": Parameter(scene.n_taps, "not stated in the paper; enough for the primary path's delay and length"),
         "wiener_control_power": Parameter(
-            scene.unconstrained_power,
-            f"the reference is scaled so that the unconstrained Wiener control power is "
-            f"{scene.unconstrained_power / scene.rated_power:g} times the rated power: the constraint has to act",
+            scene.unconstrained_power, "the reference is scaled to it: the constraint acts"
         ),
-        "wiener_noise_reduction_db": Parameter(
-            scene.wiener_noise_reduction_db, "batch least squares, unconstrained, without sensor noise"
-        ),
+        "wiener_noise_reduction_db": Parameter(scene.wiener_noise_reduction_db, "unconstrained, without sensor noise"),
         "reference_power": Parameter(float(np.mean(scene.references[0] ** 2)), "follows from the control power"),
         "sensor_noise_std": Parameter(scene.sensor_noise_std, "60 dB below the disturbance"),
-        "measurement_noise_q": Parameter(
-            scene.measurement_noise, "estimate of eq. 7: residual of a batch fit to a run without control"
-        ),
-        "initial_variance_P0": Parameter(
-            scene.initial_variance,
-            "Wiener control power over L times the reference's power: the weights' expected square",
-        ),
+        "measurement_noise_q": Parameter(scene.measurement_noise, "eq. 7: residual of a batch fit without control"),
+        "initial_variance_P0": Parameter(scene.initial_variance, "Wiener control power over L times the reference's"),
         "power_memory_s": Parameter(scene.power_memory_s, "exponential window; the package's default"),
         "secondary_path_estimate": Parameter("exact", "the paper models no mismatch"),
-        "switch_on_s": Parameter(
-            scene.switch_on_s,
-            "the noise runs before the control is switched on, so that delay lines and powers are those of the noise",
-        ),
+        "switch_on_s": Parameter(scene.switch_on_s, "the noise runs before, and fills delay lines and powers"),
         "nse_window_s": Parameter(scene.nse_window_s, "5 ms; 50 ms if one random run would not settle at 5 ms"),
         "seeds": Parameter(scene.seeds, "of the noise, if it is random"),
         "sensor_noise_seeds": Parameter(scene.sensor_noise_seeds, "apart from the noise's"),
@@ -124,28 +112,19 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
 def tried(trials: Iterable[Trial]) -> list[tuple[Any, ...]]:
     """Return what was tried for results.json: setting, mean NSE in dB and output power, or that it diverged."""
     return [
-        (t.setting, "diverged")
-        if t.diverged
-        else (t.setting, round(t.mean_nse_db, 3), np.round(t.output_power, 5).tolist())
+        (t.setting, *(("diverged",) if t.diverged else (round(t.mean_nse_db, 3), np.round(t.output_power, 5).tolist())))
         for t in trials
     ]
 
 
 def tuned_in_words(tuned: Mapping[str, Tuned | None]) -> dict[str, Any]:
     """Return settings for results.json: the best and all that were tried; None if every one diverged."""
-    registry = {**algorithms(), **algorithms(several_channels=True)}
-    return {
-        name: None
-        if best is None
-        else {
-            "kind": registry[name].kind,
-            "setting": best.setting,
-            "within_budget": best.within_budget,
-            "at_edge": best.at_edge,
-            "tried": tried(best.trials),
-        }
-        for name, best in tuned.items()
-    }
+    words: dict[str, Any] = dict.fromkeys(tuned)
+    for name, best in tuned.items():
+        if best is not None:
+            own = {name: getattr(best, name) for name in ("setting", "within_budget", "at_edge")}
+            words[name] = {"kind": algorithms()[name].kind, **own, "tried": tried(best.trials)}
+    return words
 
 
 def case_parameters(n_taps: Parameter) -> dict[str, Parameter]:
@@ -153,9 +132,7 @@ def case_parameters(n_taps: Parameter) -> dict[str, Parameter]:
     return {
         "fs_hz": Parameter(FS, "the rate of the measured duct"),
         "n_taps": n_taps,
-        "unconstrained_control_power": Parameter(
-            1.0, "every noise is scaled to it: (R_x' + q/(N P0) I) w = r over the record"
-        ),
+        "unconstrained_control_power": Parameter(1.0, "every noise is scaled to it: (R_x' + q/(N P0) I) w = r"),
         "switch_on_s": Parameter(SWITCH_ON_S, "the noise runs before"),
         "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "below the disturbance"),
     }
@@ -192,9 +169,7 @@ def without_measured(names: Iterable[str]) -> list[str]:
 def tuning_note(tuned: Mapping[str, Tuned]) -> list[str]:
     """Return the notes on the settings: which kept no budget, and which lie at the edge of the grid."""
     over = [name for name, best in tuned.items() if not best.within_budget]
-    notes = [
-        f"{name} kept its budget to 2 % at no setting tried; the one of lowest mean NSE is shown." for name in over
-    ]
+    notes = [f"{name} kept its budget at no setting tried; the one of lowest mean NSE is shown." for name in over]
     edge = [f"{name} ({best.setting:g})" for name, best in tuned.items() if best.at_edge]
     if edge:
         notes.append(

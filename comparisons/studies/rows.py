@@ -119,10 +119,8 @@ def figure_table(
     column_of: str = "algorithm",
 ) -> Table:
     """Return a table of one figure: a line for the keys, given by heading and name, and a column for each algorithm."""
-    cells = (
-        (tuple(getattr(row, name) for name in keys.values()), getattr(row, column_of), cell(row, figure))
-        for row in rows
-    )
+    beginning = grouped(rows, *keys.values(), column_of)
+    cells = ((tuple(begins), name, cell(row, figure)) for (*begins, name), (*_, row) in beginning.items())
     return table_of_cells(stem, caption, list(keys), columns, cells)
 
 

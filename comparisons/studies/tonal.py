@@ -8,18 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import (
-    HardClipAmplifier,
-    SimulationResult,
-    bandpass_path,
-    bench,
-    noise_reduction_db,
-    output_power,
-    plot,
-)
+from kfopc_filterpy import HardClipAmplifier, SimulationResult, bandpass_path, bench, plot
 from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, algorithms
 from kfopc_filterpy.bounds import wiener_solution
-from kfopc_filterpy.metrics import harmonics_db, peak_control_signal
+from kfopc_filterpy.metrics import harmonics_db, noise_reduction_db, output_power, peak_control_signal
 from kfopc_filterpy.signals import tone
 
 from . import report_parts as parts
@@ -92,10 +84,9 @@ def main(runs: Runs) -> StudyReport:
             "noise_reduction_db_over_overdrive": sweep,
             "ordering_flips_at_overdrive_db": crossings,
             "with_less_state_noise": {
-                f"{name} at {UNFORGETTING:g}": _extremes(result, optimal_weight)
-                for name, result in unforgetting.items()
+                f"{name} at {UNFORGETTING:g}": _extremes(own, optimal_weight) for name, own in unforgetting.items()
             },
-            "with_most_state_noise": {name: _extremes(result, optimal_weight) for name, result in forgetful.items()},
+            "with_most_state_noise": {name: _extremes(own, optimal_weight) for name, own in forgetful.items()},
             "largest_optimal_weight": optimal_weight,
             "largest_weight_over_optimal": growth_of(results["KF-ANC"], optimal_weight).over_optimal,
         },
@@ -113,16 +104,8 @@ def main(runs: Runs) -> StudyReport:
 
 
 def _scene(primary: Any, secondary: Any) -> Scene:
-    scene = bench.make_scene(
-        {0: tone(TONE_HZ, DURATION_S, fs=FS)},
-        primary,
-        secondary,
-        fs=FS,
-        rated_power=RATED_POWER,
-        power_multiple=POWER_MULTIPLE,
-        n_taps=N_TAPS,
-    )
-    return replace(scene, amplifier=HardClipAmplifier(LIMIT))
+    noises, own = {0: tone(TONE_HZ, DURATION_S, fs=FS)}, {"rated_power": RATED_POWER, "power_multiple": POWER_MULTIPLE}
+    return bench.make_scene(noises, primary, secondary, fs=FS, n_taps=N_TAPS, amplifier=HardClipAmplifier(LIMIT), **own)
 
 
 def _figures(result: SimulationResult, scene: Scene) -> dict[str, float | None]:
@@ -147,7 +130,7 @@ def _overdrive_sweep(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> dict[
 
     In decibels a louder noise is the same as a smaller amplifier, so all levels share the gains of one reference.
     """
-    powers = scene.unconstrained_power / 10 ** (np.array(OVERDRIVES_DB) / 10)
+    powers = scene.unconstrained_power / 10 ** (OVERDRIVES_DB / 10)
     amplifiers = [HardClipAmplifier(float(np.sqrt(2 * power))) for power in powers]
 
     def reductions(name: str) -> list[float]:

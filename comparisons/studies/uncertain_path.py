@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, run_setting
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
 from kfopc_filterpy.controllers.posterior import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance, identify_secondary_path, path_taps, perturbed_path
 from kfopc_filterpy.signals import band_limited_noise, tone
@@ -102,19 +102,8 @@ def main(runs: Runs) -> StudyReport:
         figures=[_figure(rows)],
         notes=[*parts.without_measured(pairs), _power_note(rows), "There is one seed and one record for each case."],
         tables=[
-            figure_table(
-                stem,
-                caption,
-                rows,
-                figure,
-                {"paths": "path", "noise": "noise", "estimate": "error"},
-                ALLOWANCES,
-                "allowance",
-            )
-            for stem, caption, figure in (
-                ("worst", "Least noise reduction in dB over any second after the first", "worst_second_db"),
-                ("steady", "Noise reduction in dB over the steady half", "noise_reduction_db"),
-            )
+            _table(rows, "worst", "Least noise reduction in dB over any second after the first", "worst_second_db"),
+            _table(rows, "steady", "Noise reduction in dB over the steady half", "noise_reduction_db"),
         ],
         claims_heading="Findings",
     )
@@ -135,14 +124,9 @@ def study_noises() -> dict[str, Noise]:
 def known_paths(pair: Pair) -> dict[str, Knowledge]:
     """Return the estimates of the secondary path, by what is wrong with them."""
     secondary = pair[1]
-    found = identify_secondary_path(
-        secondary,
-        n_taps=secondary.size,
-        duration_s=IDENTIFICATION_S,
-        rng=SEED,
-        fs=FS,
-        sensor_noise_std=float(np.sqrt(np.sum(secondary**2)) * 10 ** (SENSOR_NOISE_DB / 20)),
-    )
+    std = float(np.sqrt(np.sum(secondary**2)) * 10 ** (SENSOR_NOISE_DB / 20))
+    own: dict[str, Any] = {"n_taps": secondary.size, "duration_s": IDENTIFICATION_S, "rng": SEED}
+    found = identify_secondary_path(secondary, fs=FS, sensor_noise_std=std, **own)
     wrong = {error: path_taps(perturbed_path(secondary, fs=FS, **own)) for error, own in ERRORS.items()}
     return {
         EXACT: (secondary, None),
@@ -193,18 +177,14 @@ def claims(rows: Sequence[AllowanceRow]) -> list[Claim]:
     """Return the findings, each on all cases."""
     louder = "KF-PB makes the noise louder in no second after the first"
     cost = f"With an exact path the default uncertainty costs at most {COST_DB:g} dB"
+    identified = "With a path that was identified and the uncertainty that came with it"
     low, beyond = ([row for row in rows if (row.noise == BEYOND) == high] for high in (False, True))
     return [
         _never_louder(rows, DEFAULT, f"With its default uncertainty {louder}"),
         _never_louder(rows, STATED, f"With the error stated as a tolerance {louder}"),
         _cost(low, EXACT, DEFAULT, f"{cost}, noises below three eighths of the sample rate"),
         _cost(beyond, EXACT, DEFAULT, f"{cost}, white noise"),
-        _cost(
-            rows,
-            IDENTIFIED,
-            STATED,
-            f"With a path that was identified and the uncertainty that came with it, at most {COST_DB:g} dB are lost",
-        ),
+        _cost(rows, IDENTIFIED, STATED, f"{identified}, at most {COST_DB:g} dB are lost"),
     ]
 
 
@@ -240,7 +220,12 @@ def _power_note(rows: Sequence[AllowanceRow]) -> str:
     )
 
 
-# ---- Figure
+# ---- Tables and figure
+
+
+def _table(rows: Sequence[AllowanceRow], stem: str, caption: str, figure: str) -> Table:
+    keys = {"paths": "path", "noise": "noise", "estimate": "error"}
+    return figure_table(stem, caption, rows, figure, keys, ALLOWANCES, "allowance")
 
 
 def _figure(rows: Sequence[AllowanceRow]) -> FigureItem:

@@ -69,20 +69,16 @@ def _parser() -> argparse.ArgumentParser:
         text = f"{axis.label}{choices} (default: {axis.default})"
         axes.add_argument("--" + name.replace("_", "-"), dest=name, metavar="VALUES", help=text)
     parser.add_argument("--seeds", default="8", metavar="N", help="number of seeds, or a list of them (default: 8)")
-    parser.add_argument(
-        "--scenario",
-        metavar="MODULE:FUNCTION",
-        help="your own function of a dict of values and seed that returns figures",
-    )
-    parser.add_argument(
-        "--axis", action="append", default=[], metavar="NAME=VALUES", help="an axis of your own function; once for each"
-    )
+    own = "your own function of a dict of values and seed that returns figures"
+    parser.add_argument("--scenario", metavar="MODULE:FUNCTION", help=own)
+    each = "an axis of your own function; once for each"
+    parser.add_argument("--axis", action="append", default=[], metavar="NAME=VALUES", help=each)
     place = parser.add_mutually_exclusive_group()
     place.add_argument("--jobs", type=int, metavar="N", help="processes on this machine (default: all cores)")
     place.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do it, tcp://host:8786")
     parser.add_argument("--format", choices=FORMATS, default="csv", help="of the tables (default: csv)")
     parser.add_argument(
-        "--output", type=Path, default=Path("studies/sweep"), help="folder to write into (default: studies/sweep)"
+        "--output", type=Path, default="studies/sweep", help="folder to write into (default: %(default)s)"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
@@ -118,10 +114,8 @@ def parsed_values(text: str, name: str) -> list[Any]:
 
 def _value(text: str) -> Any:
     for kind in (int, float):
-        try:
+        with suppress(ValueError):
             return kind(text)
-        except ValueError:
-            continue
     return text
 
 

@@ -54,11 +54,8 @@ def do_job(runs: Pending, scenario: Scenario | None, tuning_seed: int) -> Outcom
     for number, values in runs.items():
         with naming(values):
             outcomes[number] = as_figures(scenario(dict(values)))
-            clash = set(outcomes[number]) & set(values)
-            if clash:
-                raise ValueError(
-                    f"the figure {min(clash)!r} has the name of an axis or the seed: call it something else"
-                )
+            if clash := set(outcomes[number]) & set(values):
+                raise ValueError(f"the figure {min(clash)!r} has the name of an axis or the seed: rename it")
     return outcomes
 
 

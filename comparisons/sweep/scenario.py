@@ -15,30 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import (
-    SimulationResult,
-    clipped_fraction,
-    convergence_time_s,
-    noise_reduction_db,
-    output_power,
-)
+from kfopc_filterpy import SimulationResult, clipped_fraction, convergence_time_s, noise_reduction_db, output_power
 from kfopc_filterpy.bench import AllDivergedError, Scene, algorithms, make_controller, run_setting, tune
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot.style import decibels
 
-from ..studies.cases import (
-    FS,
-    SWITCH_ON_S,
-    WINDOW_S,
-    Pair,
-    Setting,
-    made_noises,
-    make_case,
-    modelled_paths,
-    noises,
-    paths,
-)
+from ..studies import cases
+from ..studies.cases import FS, SWITCH_ON_S, WINDOW_S, Pair, Setting
 from .grid import AMPLIFIERS, DEFAULT_SETTING, TUNED_SETTING, Values
 
 # Axes that runs of one scene agree in, and those that a gain sequence depends on besides.
@@ -53,13 +37,9 @@ MEASURES: dict[str, Callable[[SimulationResult, Scene], float]] = {
     "noise_reduction_db": lambda run, scene: noise_reduction_db(run.error, run.disturbance),
     "output_power_db": lambda run, scene: float(decibels(output_power(run.control_signal))),
     "power_over_rated": lambda run, scene: output_power(run.control_signal) / scene.rated_power,
-    "worst_window_over_rated": lambda run, scene: overshoot(
-        run.control_signal, scene.rated_power, FS, window_s=WINDOW_S
-    ),
+    "worst_window_over_rated": lambda run, at: overshoot(run.control_signal, at.rated_power, FS, window_s=WINDOW_S),
     "clipped_fraction": lambda run, scene: clipped_fraction(run.control_signal, scene.amplitude_limit),
-    "convergence_time_s": lambda run, scene: convergence_time_s(
-        run.error, run.disturbance, FS, window_s=scene.nse_window_s
-    ),
+    "convergence_time_s": lambda run, at: convergence_time_s(run.error, run.disturbance, FS, window_s=at.nse_window_s),
 }
 
 Figures = dict[str, Any]
@@ -165,9 +145,9 @@ def scene_of(scenario: Values) -> Scene:
 @lru_cache(maxsize=4)
 def _noise_scene(path: str, noise: str, duration_s: float, n_taps: int, sensor_noise_db: float, seed: int) -> Scene:
     """Return the scene of one noise, of unconstrained control power 1."""
-    made = made_noises()
-    signal = (made if noise in made else noises())[noise](duration_s + SWITCH_ON_S, seed)
-    return make_case(_path_pair(path), signal, n_taps=n_taps, sensor_noise_db=sensor_noise_db, seed=seed)
+    made = cases.made_noises()
+    signal = (made if noise in made else cases.noises())[noise](duration_s + SWITCH_ON_S, seed)
+    return cases.make_case(_path_pair(path), signal, n_taps=n_taps, sensor_noise_db=sensor_noise_db, seed=seed)
 
 
 @lru_cache(maxsize=256)  # a phase is fitted by least squares: seconds for a long path
@@ -179,8 +159,8 @@ def _estimated_path(path: str, gain_db: float, delay: float, phase_deg: float) -
 
 
 def _path_pair(name: str) -> Pair:
-    modelled = modelled_paths()
-    return modelled[name] if name in modelled else paths()[name]
+    modelled = cases.modelled_paths()
+    return modelled[name] if name in modelled else cases.paths()[name]
 
 
 def _given_setting(scenario: Values) -> Any:
@@ -193,11 +173,10 @@ def _given_setting(scenario: Values) -> Any:
 def _tuned(scenario: tuple[tuple[str, Any], ...]) -> Setting | None:
     """Return the best setting of a scenario by the studies' rule; None if all diverge."""
     values = dict(scenario)
-    algorithm = values["algorithm"]
-    try:
+    with suppress(AllDivergedError):
+        algorithm = values["algorithm"]
         return tune(_OneByOne(), scene_of(values), (algorithm,))[algorithm].setting  # type: ignore[arg-type]
-    except AllDivergedError:
-        return None
+    return None
 
 
 class _OneByOne:

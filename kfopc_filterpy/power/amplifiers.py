@@ -118,7 +118,7 @@ def compiled_model(amplifier: Amplifier | None) -> np.ndarray | None:
     if amplifier is None:
         return LinearAmplifier().model
     if isinstance(amplifier, type):
-        raise TypeError(f"amplifier must be an object, such as HardClipAmplifier(1.0), got the class {amplifier!r}")
+        raise TypeError(f"amplifier must be an object, such as HardClipAmplifier(limit=1.0), got {amplifier!r}")
     models = (LinearAmplifier, HardClipAmplifier, SoftSaturationAmplifier)
     return amplifier.model if isinstance(amplifier, models) and type(amplifier) in models else None
 

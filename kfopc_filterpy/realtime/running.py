@@ -230,7 +230,7 @@ class _Session:
         lost, underflows = self.lost - lost, self.underflows - underflows
         if lost or underflows:
             gap = f"{lost} samples were lost" if lost else f"the output ran dry {underflows} time(s)"
-            raise FaultError(f"{gap} while {task}: use longer blocks, or more of them ahead, or run again")
+            raise FaultError(f"{gap} while {task}, so it would be wrong: use longer blocks, or run again")
 
     def step(self, supervisor: Supervisor) -> tuple[Any, np.ndarray] | None:
         """Process a block; return it with its control signals, None at the end."""
@@ -457,7 +457,9 @@ def run(
 
     known = {"full_scale": None, "blocks_can_repeat": True}
     settings: dict[str, Any] = {name: getattr(interface, name, value) for name, value in known.items()} | supervision
-    supervised = partial(Supervisor, fs=interface.fs, amplitude_limit=amplitude_limit, **settings)
+    supervised: Callable[[Any], Supervisor] = partial(
+        Supervisor, fs=interface.fs, amplitude_limit=amplitude_limit, **settings
+    )
     supervisor = supervised(made)
     _require_fit(supervisor, interface)
     possible_db = _possible_db(silence, made, interface.fs) if check_causality else np.nan

@@ -94,7 +94,7 @@ def test_measured_room_of_own_paths_is_checked():
         room.fs = 1
     with pytest.raises(ValueError, match=r"secondary must have shape \(K microphones, inputs, taps\), got \(2, 3\)"):
         MeasuredRoom(np.ones((2, 1, 3)), np.ones((2, 3)))
-    with pytest.raises(ValueError, match=r"must have the same K microphones first, got 3 and 2"):
+    with pytest.raises(ValueError, match=r"must have the same K microphones as their first axis, got 3 and 2"):
         MeasuredRoom(np.ones((3, 1, 3)), np.ones((2, 2, 3)))
     with pytest.raises(ValueError, match="primary must be finite"):
         MeasuredRoom(np.full((2, 1, 3), np.nan), np.ones((2, 2, 3)))
