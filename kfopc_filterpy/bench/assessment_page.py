@@ -19,7 +19,7 @@ from kfopc_filterpy.plot.style import new_axes
 
 from .page import images, players, rendered
 from .report import write_files, write_whole
-from .study_report import EXCERPT_S, HEADROOM, SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Sound, StudyReport, Table
+from .study_report import SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Sound, StudyReport, Table
 
 if TYPE_CHECKING:
     from .assessment import Assessment
@@ -45,43 +45,20 @@ def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Pat
     """Write the page, the figures, the sounds and verdict.json into a folder; return the path of the page."""
     require_page()
     path, volts = Path(folder), verdict.volts_per_unit
-    study = StudyReport(
-        "verdict",
-        "Verdict",
-        "",
-        verdict.fs,
-        float(np.max(verdict.limits.rated_power)),  # which this page does not show
-        {},
-        {},
-        figures=list(_figures(verdict)),
-        sounds=_sounds(verdict),
-        tables=list(_tables(verdict)),
-    )
+    parts: dict[str, Any] = {"figures": list(_figures(verdict)), "sounds": _sounds(verdict)}
+    rated_power = float(np.max(verdict.limits.rated_power))  # which this page does not show
+    study = StudyReport("verdict", "Verdict", "", verdict.fs, rated_power, {}, tables=list(_tables(verdict)), **parts)
     write_files(study, path)
     write_whole(path / "verdict.json", verdict.json + "\n")
-    shown = images(study, path)
-    page = rendered(
-        TEMPLATE,
-        verdict=verdict,
-        lead=shown[0],
-        figures=shown[1:],
-        tables=study.tables,
-        players=list(players(study, path, verdict.algorithm)),
-        checks=_checks(verdict),
-        origin={
-            **verdict.origin,
-            "Sample rate": f"{verdict.fs:g} Hz",
-            "Volts for a control signal of 1": "not known, taken as 1 V"
-            if volts is None
-            else f"{listed(volts, 'g')} V",
-            "Version": f"kfopc_filterpy {__version__}",
-            "Date": datetime.now().astimezone().isoformat(" ", "minutes"),
-        },
-        settings=list(verdict.settings.reasons.items()),
-        values={"n_taps": verdict.settings.n_taps, **verdict.settings.settings},
-        headroom=HEADROOM,
-        excerpt_s=EXCERPT_S,
-    )
+    origin = {
+        **verdict.origin,
+        "Sample rate": f"{verdict.fs:g} Hz",
+        "Volts for a control signal of 1": "not known, taken as 1 V" if volts is None else f"{listed(volts, 'g')} V",
+        "Version": f"kfopc_filterpy {__version__}",
+        "Date": datetime.now().astimezone().isoformat(" ", "minutes"),
+    }
+    shown = {"figures": images(study, path), "players": list(players(study, path, verdict.algorithm))}
+    page = rendered(TEMPLATE, verdict=verdict, tables=study.tables, checks=_checks(verdict), origin=origin, **shown)
     write_whole(path / "verdict.html", page)
     return path / "verdict.html"
 
@@ -93,9 +70,7 @@ def _figures(verdict: Assessment) -> Iterator[FigureItem]:
         each += ", relative to its rating, of the loudspeaker that took most"
     caption = f"What a rated power buys: the least error of any fixed filter of this length, with {each}."
     if np.all(np.isfinite(verdict.least_rated_power)):
-        caption += (
-            f" Least: the least rated power with which {verdict.algorithm}, which adapts, reaches what is wanted."
-        )
+        caption += f" Least: the least with which {verdict.algorithm}, which adapts, reaches what is wanted."
     yield FigureItem("bound", caption, _bound(verdict).figure)
     yield from error_figures(
         verdict.runs,
@@ -295,43 +270,29 @@ def _power_label(verdict: Assessment) -> str:
     return f"Power (W into {listed(np.unique(verdict.ohm), 'g')} ohm)"
 
 
-def _checks(verdict: Assessment) -> list[tuple[str, str]]:
+def _checks(verdict: Assessment) -> dict[str, str]:
     """Return what was checked, and what was found, in words."""
-    band, limits = verdict.band, verdict.limits
-    late = verdict.causality_margin_s
-    peak = "no peak limit"
-    if limits.amplitude_limit is not None:
-        peak = _peak_limits(verdict)
-    checks = [
-        (
-            "Rating",
-            f"{verdict.power(limits.rated_power)}, decided by the {_listed_once(limits.decided_by)}; {peak}; "
-            f"windows of {limits.window_s:g} s",
-        ),
-        ("Power for full control", verdict.power(verdict.unlimited_power)),
-        (f"Least power for {verdict.want_db:g} dB, best fixed filter", _or_none(verdict, verdict.required_rated_power)),
-        (
-            f"Least power for {verdict.want_db:g} dB, {verdict.algorithm}, found by runs",
-            _or_none(verdict, verdict.least_rated_power),
-        ),
-        (
-            "Causality",
-            "unknown without a primary path"
-            if late is None
-            else f"the anti-noise is {abs(1e3 * late):.2g} ms {'early' if late >= 0 else 'late'}",
-        ),
-        (
-            "Band of the noise",
-            f"90 % of its power from {band.low_hz:.0f} to {band.high_hz:.0f} Hz; "
-            f"{band.weak_share:.1%} where the loudspeaker is 20 dB weaker than its mean there",
-        ),
-    ]
+    band, limits, late = verdict.band, verdict.limits, verdict.causality_margin_s
+    decided = [limits.decided_by] if isinstance(limits.decided_by, str) else dict.fromkeys(limits.decided_by)
+    peak = "no peak limit" if limits.amplitude_limit is None else _peak_limits(verdict)
+    causality, least = "unknown without a primary path", f"Least power for {verdict.want_db:g} dB"
+    if late is not None:
+        causality = f"the anti-noise is {abs(1e3 * late):.2g} ms {'early' if late >= 0 else 'late'}"
+    checks = {
+        "Rating": f"{verdict.power(limits.rated_power)}, decided by the {', '.join(decided)}; {peak}; "
+        f"windows of {limits.window_s:g} s",
+        "Power for full control": verdict.power(verdict.unlimited_power),
+        f"{least}, best fixed filter": _or_none(verdict, verdict.required_rated_power),
+        f"{least}, {verdict.algorithm}, found by runs": _or_none(verdict, verdict.least_rated_power),
+        "Causality": causality,
+        "Band of the noise": f"90 % of its power from {band.low_hz:.0f} to {band.high_hz:.0f} Hz; "
+        f"{band.weak_share:.1%} where the loudspeaker is 20 dB weaker than its mean there",
+    }
     if verdict.levels is not None:
-        before, after = verdict.levels.before_dba, verdict.levels.after_dba
-        text = f"{listed(before, '.1f')} dBA without control, {listed(after, '.1f')} dBA with it"
-        checks.append(("A-weighted level", text))
+        before, after = (listed(one, ".1f") for one in (verdict.levels.before_dba, verdict.levels.after_dba))
+        checks["A-weighted level"] = f"{before} dBA without control, {after} dBA with it"
     if verdict.excursion_mm is not None:
-        checks.append(("Largest excursion", f"{verdict.excursion_mm:.2g} mm"))
+        checks["Largest excursion"] = f"{verdict.excursion_mm:.2g} mm"
     return checks
 
 
@@ -342,10 +303,6 @@ def _peak_limits(verdict: Assessment) -> str:
         in_volts = verdict.volts_per_unit is not None
         return f"peak limit {_number(limits, verdict.volts_per_unit):.3g}{' V' if in_volts else ''}"
     return f"peak limits {', '.join('none' if one is None else f'{one:.3g}' for one in limits)}"
-
-
-def _listed_once(texts: Any) -> str:
-    return texts if isinstance(texts, str) else ", ".join(dict.fromkeys(texts))
 
 
 def _or_none(verdict: Assessment, power: Any) -> str:

@@ -29,6 +29,10 @@ POWER_WINDOW_S = 0.05
 POWER_EVERY_S = 0.01
 SEGMENT_S = 0.064  # of the spectra
 ROUNDING = 1e-12
+SIGNALS = {  # of a run, with the names of their powers in an `ExploreResult`
+    **{"disturbance": "disturbance_power", "error": "error_power"},
+    **{"control_signal": "asked_power", "amplifier_output": "delivered_power"},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,24 +383,14 @@ def explore(setup: AcousticSetup, settings: ExploreSettings | None = None) -> Ex
         bound = power_constrained_solution(*scene.settled, scene.secondary, N_TAPS, rated)
     frequencies, of_disturbance = power_spectrum_db(run.disturbance, run.fs, segment_s=SEGMENT_S)
     shown = slice(round(POWER_WINDOW_S * run.fs) - 1, None, round(POWER_EVERY_S * run.fs))  # from the first full window
-    powers = {
-        name: short_time_power(signal, run.fs, POWER_WINDOW_S)[shown]
-        for name, signal in (
-            ("disturbance_power", run.disturbance),
-            ("error_power", run.error),
-            ("asked_power", run.control_signal),
-            ("delivered_power", run.amplifier_output),
-        )
-    }
+    signals: dict[str, Any] = {name: getattr(run, name) for name in SIGNALS}
+    powers = {SIGNALS[name]: short_time_power(own, run.fs, POWER_WINDOW_S)[shown] for name, own in signals.items()}
     return ExploreResult(
         settings=settings,
         fs=run.fs,
         rated_power=rated,
         full_power=full,
-        disturbance=run.disturbance,
-        error=run.error,
-        control_signal=run.control_signal,
-        amplifier_output=run.amplifier_output,
+        **signals,
         frequencies_hz=frequencies,
         disturbance_spectrum_db=of_disturbance,
         error_spectrum_db=power_spectrum_db(run.error, run.fs, segment_s=SEGMENT_S)[1],
@@ -417,16 +411,8 @@ def _normalised_scene(setup: AcousticSetup, band: tuple[float, float]) -> Scene:
 
     It is what takes long of a run, and level and rating only scale it.
     """
-    return make_scene(
-        {0: _noise(setup, band)},
-        setup.primary,
-        setup.secondary,
-        fs=setup.fs,
-        rated_power=1.0,
-        power_multiple=1.0,
-        n_taps=N_TAPS,
-        switch_on_s=SWITCH_ON_S,
-    )
+    own: dict[str, Any] = {"rated_power": 1.0, "power_multiple": 1.0, "n_taps": N_TAPS, "switch_on_s": SWITCH_ON_S}
+    return make_scene({0: _noise(setup, band)}, setup.primary, setup.secondary, fs=setup.fs, **own)
 
 
 def _noise(setup: AcousticSetup, band: tuple[float, float]) -> np.ndarray:

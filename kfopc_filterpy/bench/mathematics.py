@@ -22,28 +22,19 @@ FORMULAS = {
     "G_s": r"G_s",
     "P0": r"P_0",
 }
-# Parameters by their names in results.json: symbol as TeX, "" if there is none, and meaning.
+# Parameters that have a symbol, by their names in results.json: symbol as TeX, and meaning.
 PARAMETERS = {
-    "amplitude": ("", "amplitude of the reference"),
     "amplitude_limits": (r"A^2", "limits of the peak-limited algorithms, squared, over the amplifier's"),
     "averaging time in s": (r"T", "time over which the power is averaged in s"),
     "averaging_s": (r"T", "time over which the power is averaged in s"),
-    "band_hz": ("", "band of the noise in Hz"),
-    "change_s": ("", "time of the change in s"),
-    "duration_s": ("", "duration in s"),
-    "durations_s": ("", "durations in s"),
     "fs_hz": (r"f_s", "sampling frequency in Hz"),
     "initial_variance_P0": (r"P_0", "initial variance of the weights"),
-    "jump_s": ("", "start and end of the jump in s"),
     "leak over E[x'^2]": (r"\gamma / E[x'^2]", "leak, without units"),
-    "limiter_window_s": ("", "window of the limiter in s"),
     "measurement_noise_q": (r"q", "variance of the measurement noise"),
     "mu": (r"\mu", "step size"),
     "mu L E[x'^2]": (r"\mu L E[x'^2]", "step size, without units"),
     "n_taps": (r"L", "taps of the control filter"),
-    "nse_window_s": ("", "window of the normalised squared error (NSE) in s"),
     "penalty factor over G_s": (r"\beta / G_s", "penalty factor, without units"),
-    "power_memory_s": ("", "memory of the power estimates in s"),
     "primary_path": (r"P(z)", "primary path"),
     "r": (r"r", "variance of the state noise"),
     "r E[x'^2]/q": (r"r E[x'^2] / q", "state noise, without units"),
@@ -52,16 +43,14 @@ PARAMETERS = {
     "reference_power": (r"E[x^2]", "power of the reference"),
     "secondary_path": (r"S(z)", "secondary path"),
     "secondary_path_estimate": (r"\hat{S}(z)", "estimate of the secondary path"),
-    "sensor_noise_db": ("", "level of the sensor noise in dB"),
     "sensor_noise_std": (r"\sigma_v", "standard deviation of the sensor noise"),
-    "switch_on_s": ("", "time of the switch-on in s"),
-    "tone_hz": ("", "frequency of the tone in Hz"),
     "unconstrained_control_power": (r"E[y^2]", "power of the unconstrained control signal"),
     "wiener_control_power": (r"E[y^2]", "power of the unconstrained Wiener control signal"),
-    "wiener_noise_reduction_db": ("", "noise reduction of the unconstrained Wiener filter in dB"),
     "1 - lambda": (r"1 - \lambda", "forgetting"),
 }
 _MINUS = "\N{MINUS SIGN}"
+_UNITS = {"_hz": "Hz", "_s": "s", "_db": "dB"}  # at the ends of other names
+_UNIT = re.compile("(_hz|_s|_db)$")
 
 
 def mathml(tex: str, display: str = "inline") -> Markup:
@@ -116,7 +105,7 @@ def parameter(name: str) -> tuple[Markup | str, str]:
     >>> parameter("own_setting")
     ('', 'own setting')
     """
-    tex, meaning = PARAMETERS.get(name, ("", name.replace("_", " ")))
+    tex, meaning = PARAMETERS.get(name, ("", _UNIT.sub(lambda unit: f" in {_UNITS[unit[0]]}", name).replace("_", " ")))
     return (mathml(tex) if tex else ""), meaning
 
 

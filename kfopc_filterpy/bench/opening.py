@@ -36,10 +36,9 @@ def claims_sentence(studies: Sequence[StudyReport]) -> str:
     >>> claims_sentence([study("a", kept, kept), study("b", over, kept, over)])
     '3 of the 5 claims of the paper were reproduced; the others are of b (2).'
     """
-    kinds: dict[bool, list[StudyReport]] = {True: [], False: []}
-    for study in studies:
-        kinds[study.claims_heading == OF_THE_PAPER].append(study)
-    return " ".join(filter(None, (_sentence(own, of_paper) for of_paper, own in kinds.items())))
+    paper = [study for study in studies if study.claims_heading == OF_THE_PAPER]
+    beyond = [study for study in studies if study.claims_heading != OF_THE_PAPER]
+    return " ".join(filter(None, (_sentence(paper, True), _sentence(beyond, False))))
 
 
 def _sentence(studies: Sequence[StudyReport], of_paper: bool) -> str:

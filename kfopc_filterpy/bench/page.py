@@ -11,21 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from . import study_report
 from .descriptions import described
 from .mathematics import mathml, parameter, prose
 from .opening import claims_sentence
-from .study_report import (
-    EXCERPT_S,
-    HEADROOM,
-    FigureItem,
-    Parameter,
-    Sound,
-    StudyReport,
-    file_of,
-    jsonable,
-    loudness,
-    merit_table,
-)
+from .study_report import FigureItem, Parameter, Sound, StudyReport, file_of, jsonable, loudness, merit_table
 
 TITLE = "Kalman filter with output power constraint"
 WITHOUT_CLAIMS = "Comparison of algorithms"
@@ -57,8 +47,6 @@ def page(studies: Sequence[StudyReport], folder: Path, lead: FigureItem | None) 
         described=described(name for name in names if name != "KF-OPC"),
         lead=first,
         claims=claims_sentence(studies),
-        headroom=HEADROOM,
-        excerpt_s=EXCERPT_S,
         parts=[_part(study, own, folder) for study, own in zip(studies, figures, strict=True)],
     )
 
@@ -67,13 +55,10 @@ def rendered(template: str, **values: Any) -> str:
     """Return a template of this folder, filled in with values, which are escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    layout = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        keep_trailing_newline=True,
-    )
+    folder = FileSystemLoader(Path(__file__).parent)
+    layout = Environment(loader=folder, autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True)
     layout.filters |= {"math": mathml, "prose": prose}
+    layout.globals |= {"headroom": study_report.HEADROOM, "excerpt_s": study_report.EXCERPT_S}
     return layout.get_template(template).render(**values)
 
 
@@ -101,10 +86,8 @@ def _merit(study: StudyReport) -> tuple[list[str], list[list[str]]]:
     columns, rows = merit_table(study)
     headings = [heading.capitalize() + (f" ({unit})" if unit else "") for heading, unit in columns]
     kept = [i for i in range(len(headings)) if any(row[i] != "-" for row in rows)]
-    shown = [
-        [name, *("–" if row[i] == "-" else row[i] for i in kept)]
-        for name, row in zip(study.algorithms, rows, strict=True)
-    ]
+    cells = (["–" if row[i] == "-" else row[i] for i in kept] for row in rows)
+    shown = [[name, *own] for name, own in zip(study.algorithms, cells, strict=True)]
     return ["Algorithm", *(headings[i] for i in kept)], shown
 
 
@@ -115,14 +98,8 @@ def _parameters(parameters: Mapping[str, Parameter], algorithms: Mapping[str, An
         whose = next((algorithm for algorithm in longest_first if name.startswith(f"{algorithm} ")), "")
         symbol, meaning = parameter(name.removeprefix(f"{whose} ") if whose else name)
         lines = _text(jsonable(own.value)).split("\n")
-        yield {
-            "whose": whose,
-            "symbol": symbol,
-            "meaning": meaning,
-            "lines": lines,
-            "folded": len(lines) > _LONG,
-            "chosen": own.chosen,
-        }
+        said = {"whose": whose, "symbol": symbol, "meaning": meaning, "chosen": own.chosen}
+        yield {**said, "lines": lines, "folded": len(lines) > _LONG}
 
 
 def _text(value: Any) -> str:

@@ -13,16 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.signal import fftconvolve
 
-from kfopc_filterpy import (
-    HardClipAmplifier,
-    SimulationResult,
-    clipped_fraction,
-    convergence_time_s,
-    noise_reduction_db,
-    output_power,
-    simulate,
-    simulate_scenarios,
-)
+from kfopc_filterpy import HardClipAmplifier, SimulationResult, metrics, simulate, simulate_scenarios
 from kfopc_filterpy._validate import as_channels, as_positive, as_signal, per_loudspeaker
 from kfopc_filterpy.bounds import (
     WienerSolution,
@@ -33,7 +24,6 @@ from kfopc_filterpy.bounds import (
 from kfopc_filterpy.bounds.channel_bound import full_channel_stretch
 from kfopc_filterpy.controllers import Controller, CoreController
 from kfopc_filterpy.loop.inputs import channel_disturbances
-from kfopc_filterpy.metrics import peak_control_signal
 from kfopc_filterpy.paths import path_taps
 from kfopc_filterpy.paths.path_matrix import is_path_matrix, secondary_paths
 from kfopc_filterpy.power.amplifiers import Amplifier
@@ -475,12 +465,12 @@ def figures_of_merit(results: Sequence[SimulationResult], scene: Scene) -> dict[
     errors = np.array([r.error for r in results])
     disturbances = np.array([r.disturbance for r in results])
     return {
-        "noise_reduction_db": float(np.mean([noise_reduction_db(r.error, r.disturbance) for r in results])),
-        "output_power": float(np.mean([np.max(output_power(y)) for y in control])),
-        "peak_control_signal": float(np.mean([np.max(peak_control_signal(y)) for y in control])),
-        "clipped_fraction": float(np.mean([np.max(clipped_fraction(y, limit)) for y in control])),
+        "noise_reduction_db": float(np.mean([metrics.noise_reduction_db(r.error, r.disturbance) for r in results])),
+        "output_power": float(np.mean([np.max(metrics.output_power(y)) for y in control])),
+        "peak_control_signal": float(np.mean([np.max(metrics.peak_control_signal(y)) for y in control])),
+        "clipped_fraction": float(np.mean([np.max(metrics.clipped_fraction(y, limit)) for y in control])),
         "harmonics_db": None,
-        "convergence_time_s": convergence_time_s(
+        "convergence_time_s": metrics.convergence_time_s(
             errors, disturbances, scene.fs, window_s=scene.nse_window_s, runs=True
         ),
         "diverged_at_s": min(diverged) if diverged else None,

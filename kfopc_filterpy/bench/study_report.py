@@ -15,13 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FIGURES_OF_MERIT = (
-    "noise_reduction_db",
-    "output_power",
-    "peak_control_signal",
-    "clipped_fraction",
-    "harmonics_db",
-    "convergence_time_s",
-    "diverged_at_s",
+    *("noise_reduction_db", "output_power", "peak_control_signal", "clipped_fraction"),
+    *("harmonics_db", "convergence_time_s", "diverged_at_s"),
 )
 OF_THE_PAPER = "Claims of the paper"
 HEADROOM = 4.0  # peak of a sound, over that of the study's first sound, beyond which it is clipped
@@ -146,7 +141,8 @@ class FigureItem:
         )
         drawn = dict.fromkeys(filter(None, (_axes_in_words(ax, self.figure.axes) for ax in self.figure.axes)))
         curves = f". Curves: {'; '.join(names)}." if names else "."
-        return _plain(f"Plot of {'; '.join(drawn)}{curves}") if drawn else ""
+        text = f"Plot of {'; '.join(drawn)}{curves}" if drawn else ""
+        return re.sub(r"[${}\\]|\\mathrm", "", text)  # the marks of matplotlib's formulas
 
 
 def _axes_in_words(ax: Axes, others: Sequence[Axes]) -> str:
@@ -154,11 +150,6 @@ def _axes_in_words(ax: Axes, others: Sequence[Axes]) -> str:
     below = next((own.get_xlabel() for own in [ax, *others] if own.get_xlabel()), "")
     words = [ax.get_ylabel(), below] if ax.get_ylabel() else []
     return " over ".join(" ".join(word.split()) for word in words if word)
-
-
-def _plain(text: str) -> str:
-    """Return a text without the marks of matplotlib's formulas."""
-    return re.sub(r"[${}\\]|\\mathrm", "", text)
 
 
 @dataclass(frozen=True)
@@ -292,7 +283,7 @@ class StudyReport:
             "algorithms": {
                 name: {key: figures.get(key) for key in FIGURES_OF_MERIT} for name, figures in self.algorithms.items()
             },
-            "claims": [{"text": claim.text, "holds": claim.holds, "measured": claim.measured} for claim in self.claims],
+            "claims": [vars(claim) for claim in self.claims],
             "extra": self.extra,
         }
         return jsonable(values, f"study {self.name!r}")
