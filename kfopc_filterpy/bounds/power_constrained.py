@@ -17,23 +17,12 @@ from .._validate import as_nonnegative, as_positive, as_sample_count, per_loudsp
 from ..metrics import overshoot
 from ..paths.models import path_taps
 from ..paths.path_matrix import is_path_matrix
+from . import wiener
 from .channel_bound import channel_record
-from .wiener import (
-    Record,
-    Stretch,
-    WienerSolution,
-    constrained_weights,
-    full_stretch,
-    loss_db,
-    mean_square,
-    record_of,
-    reduction_db,
-    warn_of_loss,
-)
 
 
 @dataclass(frozen=True)
-class ControlFilter(WienerSolution):
+class ControlFilter(wiener.WienerSolution):
     r"""A fixed control filter over a stretch of a record: a `WienerSolution` with how it was computed.
 
     Its weights solve :math:`(R_{x'} + λ R_x + \mathrm{ridge}\, I)\, w = α r`.
@@ -56,7 +45,7 @@ class ControlFilter(WienerSolution):
     constraint_factor: float
     start_s: float
     end_s: float
-    stretch: Record = field(repr=False, compare=False)
+    stretch: wiener.Record = field(repr=False, compare=False)
 
     @property
     def control_signal(self) -> np.ndarray:
@@ -99,7 +88,7 @@ class ControlFilters:
     def noise_reduction_db(self) -> float:
         """Noise reduction over all segments, -10 log10(sum e^2 / sum d^2), at most 300 dB."""
         d = np.concatenate([segment.stretch.d for segment in self.segments], axis=-1)
-        return reduction_db(mean_square(self.error), mean_square(d))
+        return wiener.reduction_db(wiener.mean_square(self.error), wiener.mean_square(d))
 
     @property
     def control_signal(self) -> np.ndarray:
@@ -181,10 +170,11 @@ class PowerConstrainedWiener:
                 f"got {start_s:g} s to {stop / self.fs:g} s"
             )
         part = slice(start, stop)
-        disturbance_power = mean_square(self.disturbance[..., part])
+        disturbance_power = wiener.mean_square(self.disturbance[..., part])
         names = ("whole", "per_second", "unconstrained", "scaled", "scaled_per_second")
         return {
-            name: reduction_db(mean_square(getattr(self, name).error[..., part]), disturbance_power) for name in names
+            name: wiener.reduction_db(wiener.mean_square(getattr(self, name).error[..., part]), disturbance_power)
+            for name in names
         }
 
     def within_windows(self, window_s: float = 0.1) -> ControlFilter:
@@ -335,13 +325,15 @@ def power_constrained_wiener(
     """
     fs = as_positive(fs, "fs", unit="Hz")
     ridge = as_nonnegative(ridge, "ridge")
-    record: Record
+    record: wiener.Record
     if is_path_matrix(secondary_path):
         record = channel_record(reference, disturbance, secondary_path, n_taps, fs)
         rated_power = per_loudspeaker(rated_power, record.shape[0], "rated_power")
     else:
         rated_power = as_positive(rated_power, "rated_power")
-        record = record_of(reference, disturbance, path_taps(secondary_path, fs=fs, name="secondary_path"), n_taps)
+        record = wiener.record_of(
+            reference, disturbance, path_taps(secondary_path, fs=fs, name="secondary_path"), n_taps
+        )
     first = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
     n_samples = record.d.shape[-1]
     if n_samples - first < record.n_taps:
@@ -365,7 +357,7 @@ def power_constrained_wiener(
 
     over_record = solve(first, n_samples)
     whole, unconstrained, scaled = over_record
-    warn_of_loss(max(_losses_db(counted, whole, unconstrained, ridge)))
+    wiener.warn_of_loss(max(_losses_db(counted, whole, unconstrained, ridge)))
     segments = zip(edges, [*edges[1:], n_samples], strict=True)
     each = [over_record] if len(edges) == 1 else [solve(start, stop) for start, stop in segments]
     return PowerConstrainedWiener(
@@ -383,7 +375,7 @@ def power_constrained_wiener(
 
 def power_constrained_solution(
     reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int, rated_power: float
-) -> WienerSolution:
+) -> wiener.WienerSolution:
     """Return the least-squares control filter whose control power does not exceed the rated power.
 
     The penalty γ of `wiener_solution` is chosen so that the control power is `rated_power`, or zero if the filter needs
@@ -425,33 +417,35 @@ def power_constrained_solution(
     1.0
     """
     rated_power = as_positive(rated_power, "rated_power")
-    stretch = full_stretch(reference, disturbance, secondary_path, n_taps)
+    stretch = wiener.full_stretch(reference, disturbance, secondary_path, n_taps)
     correlations = stretch.correlations()
-    weights, penalty = constrained_weights(stretch, correlations, rated_power)
-    warn_of_loss(loss_db(stretch, correlations, weights, penalty))
+    weights, penalty = wiener.constrained_weights(stretch, correlations, rated_power)
+    wiener.warn_of_loss(wiener.loss_db(stretch, correlations, weights, penalty))
     return stretch.solution(weights)
 
 
-def _losses_db(counted: Record, whole: ControlFilter, unconstrained: ControlFilter, ridge: float) -> list[float]:
+def _losses_db(counted: wiener.Record, whole: ControlFilter, unconstrained: ControlFilter, ridge: float) -> list[float]:
     """Return `loss_db` of the bound and of the filter without a budget; it is not computed for several channels."""
-    if not isinstance(counted, Stretch):
+    if not isinstance(counted, wiener.Stretch):
         return [0.0]
     correlations = counted.correlations()
     return [
-        loss_db(counted, correlations, whole.weights, penalty=whole.penalty),
-        loss_db(counted, correlations, unconstrained.weights, ridge=ridge),
+        wiener.loss_db(counted, correlations, whole.weights, penalty=whole.penalty),
+        wiener.loss_db(counted, correlations, unconstrained.weights, ridge=ridge),
     ]
 
 
-def weights_within(stretch: Record, correlations: Any, rated_power: NumberOrArray) -> tuple[np.ndarray, NumberOrArray]:
+def weights_within(
+    stretch: wiener.Record, correlations: Any, rated_power: NumberOrArray
+) -> tuple[np.ndarray, NumberOrArray]:
     """Return the weights of the least error within the power of each loudspeaker, and their λ."""
-    if isinstance(stretch, Stretch):
-        return constrained_weights(stretch, correlations, rated_power)
+    if isinstance(stretch, wiener.Stretch):
+        return wiener.constrained_weights(stretch, correlations, rated_power)
     return correlations.constrained_weights(rated_power)
 
 
 def _solve(
-    stretch: Record, rated_power: Any, ridge: float, start_s: float, end_s: float
+    stretch: wiener.Record, rated_power: Any, ridge: float, start_s: float, end_s: float
 ) -> tuple[ControlFilter, ControlFilter, ControlFilter]:
     """Return the filter within the power, the one without a budget, and the latter scaled."""
 

@@ -14,25 +14,7 @@ from numpy.typing import ArrayLike
 from .._types import NumberOrArray, PerLoudspeaker
 from .._validate import as_count, as_nonnegative, as_number, as_real_array, as_signal, require_finite
 from ..checkpoint import Checkpointed
-from .checked_steps import (
-    SILENT_REFERENCE,
-    Checks,
-    State,
-    as_matrix,
-    checked_measurement,
-    checked_prediction,
-    is_usual_measurement,
-    is_usual_prediction,
-    require_control,
-    require_measurement,
-    require_semidefinite,
-    require_unmasked,
-    require_variance,
-    restore,
-    run_or_undo,
-    state_of,
-    without_masked,
-)
+from . import checked_steps
 
 if TYPE_CHECKING:
     from ..power.constraint import OutputPowerConstraint
@@ -53,7 +35,7 @@ class _Matrix:
         self.name = name
 
     def __set__(self, kf: Any, value: Any) -> None:
-        kf.__dict__[self.name] = as_matrix(value, self.name)
+        kf.__dict__[self.name] = checked_steps.as_matrix(value, self.name)
 
 
 class KFOPC(KalmanFilter, Checkpointed):
@@ -337,13 +319,13 @@ class KFOPC(KalmanFilter, Checkpointed):
         Q: ArrayLike | None = None,
     ) -> None:
         """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
-        if not is_usual_prediction(self, F, Q):
-            u, B, F, Q = checked_prediction(self, u, B, F, Q)
-        self._all_or_nothing(super().predict, checked_prediction, u, B, F, Q)
+        if not checked_steps.is_usual_prediction(self, F, Q):
+            u, B, F, Q = checked_steps.checked_prediction(self, u, B, F, Q)
+        self._all_or_nothing(super().predict, checked_steps.checked_prediction, u, B, F, Q)
 
     def predict_steadystate(self, u: ArrayLike = 0, B: ArrayLike | None = None) -> None:
         """Run filterpy's `predict_steadystate`; arguments that would corrupt the filter raise an error first."""
-        self._all_or_nothing(super().predict_steadystate, require_control, u, B)
+        self._all_or_nothing(super().predict_steadystate, checked_steps.require_control, u, B)
 
     def update(
         self,
@@ -392,7 +374,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         """
         missing = None
         if isinstance(z, np.ma.MaskedArray):
-            z, R, H, missing = without_masked(self, z, R, H)
+            z, R, H, missing = checked_steps.without_masked(self, z, R, H)
             if missing is not None and self._constraint is not None:
                 raise ValueError("a rated power needs all measurements at once: mask them all if one is missing")
         reference = self._next_reference(z, reference)
@@ -400,10 +382,10 @@ class KFOPC(KalmanFilter, Checkpointed):
             super().update(None)
             return
         plain = self._constraint is None and self._unconstrained_factor == 1.0
-        if plain and is_usual_measurement(self, z, R, H):
-            self._all_or_nothing(super().update, checked_measurement, z, R, H)
+        if plain and checked_steps.is_usual_measurement(self, z, R, H):
+            self._all_or_nothing(super().update, checked_steps.checked_measurement, z, R, H)
         else:
-            z, R, H = checked_measurement(self, z, R, H)
+            z, R, H = checked_steps.checked_measurement(self, z, R, H)
             self._scaled_step(super().update, z, R, H, H=H, reference=reference)
         if missing is not None:
             self.z[missing] = np.nan
@@ -414,7 +396,7 @@ class KFOPC(KalmanFilter, Checkpointed):
             super().update_steadystate(None)
             return
         reference = self._next_reference(z, reference)
-        z, _, _ = checked_measurement(self, z, None, None)
+        z, _, _ = checked_steps.checked_measurement(self, z, None, None)
         self._scaled_step(super().update_steadystate, z, H=None, reference=reference)
 
     def update_correlated(
@@ -430,7 +412,7 @@ class KFOPC(KalmanFilter, Checkpointed):
             super().update_correlated(None)
             return
         reference = self._next_reference(z, reference)
-        z, R, H = checked_measurement(self, z, R, H)
+        z, R, H = checked_steps.checked_measurement(self, z, R, H)
         self._scaled_step(super().update_correlated, z, R, H, H=H, reference=reference)
 
     def update_sequential(
@@ -449,13 +431,13 @@ class KFOPC(KalmanFilter, Checkpointed):
         length = np.size(z_i)
         if not 0 <= start <= self.dim_z - length:
             raise ValueError(f"start must be 0 to dim_z - len(z_i) = {self.dim_z - length}, got {start}")
-        require_measurement(z_i, length)
+        checked_steps.require_measurement(z_i, length)
         rows = self.H[start : start + length] if H_i is None else np.reshape(H_i, (length, self.dim_x))
         require_finite(rows, "H_i")
         noise = self.R[start : start + length, start : start + length] if R_i is None else R_i
-        require_variance(noise, length, "R_i")
+        checked_steps.require_variance(noise, length, "R_i")
         if not np.any(rows) and not np.any(noise):
-            raise ValueError(SILENT_REFERENCE)
+            raise ValueError(checked_steps.SILENT_REFERENCE)
 
         def update_sequential(scaled: Any, R_i: Any, H_i: Any) -> None:
             # filterpy writes into these four in place: give it copies, so that the step can be undone
@@ -524,7 +506,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         try:
             result = super().batch_filter(samples, Fs, Qs, Hs, Rs, Bs, us, update_first, counting)
         except BaseException as error:
-            restore(self, before)
+            checked_steps.restore(self, before)
             if not isinstance(error, ValueError | TypeError):
                 raise
             kind = TypeError if isinstance(error, TypeError) else ValueError
@@ -561,18 +543,18 @@ class KFOPC(KalmanFilter, Checkpointed):
             self._mahalanobis = sqrt(np.dot(np.dot(self.y.T, self.SI), self.y).item())
         return self._mahalanobis
 
-    def __getstate__(self) -> State:
+    def __getstate__(self) -> checked_steps.State:
         """Return the state for a deep copy or a file, without what is made anew when it is needed."""
-        attributes, private = state_of(self)
+        attributes, private = checked_steps.state_of(self)
         return attributes, private | {"_batch_references": None}
 
     def __copy__(self) -> Self:
         """Return a copy that shares no array that a step writes into."""
         other = object.__new__(type(self))
-        restore(other, self._snapshot())
+        checked_steps.restore(other, self._snapshot())
         return other
 
-    def _snapshot(self) -> State:
+    def _snapshot(self) -> checked_steps.State:
         """Return the state with copies of what a step writes into."""
         attributes, private = self.__getstate__()
         return attributes, private | {name: deepcopy(private[name]) for name in self._written_into}
@@ -637,7 +619,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         return samples
 
     def _presently_scaled(self, z: Any) -> Any:
-        require_unmasked(z)
+        checked_steps.require_unmasked(z)
         return self._scaled(z, self.constraint_factor)
 
     @staticmethod
@@ -684,11 +666,11 @@ class KFOPC(KalmanFilter, Checkpointed):
         """Check P if it was assigned or written into since the last step, so that other steps do not pay for it."""
         P = np.asarray(self.P).tobytes()
         if np.asarray(self.P_post).tobytes() != P and np.asarray(self.P_prior).tobytes() != P:
-            require_semidefinite(self.P, "P")
+            checked_steps.require_semidefinite(self.P, "P")
 
-    def _all_or_nothing(self, step: Callable[..., None], checks: Checks | None, *arguments: Any) -> None:
+    def _all_or_nothing(self, step: Callable[..., None], checks: checked_steps.Checks | None, *arguments: Any) -> None:
         self._take_in_edits()
-        run_or_undo(self, step, arguments, checks)
+        checked_steps.run_or_undo(self, step, arguments, checks)
 
 
 class BatchReferences:

@@ -13,16 +13,7 @@ from .._validate import as_count, as_nonnegative, as_number, require_finite
 from ..core.block import LOUD_STEP, NO_SOLUTION
 from ..core.triangle import covariance_update, direction_of
 from ..power.constraint import OutputPowerConstraint
-from .checked_steps import (
-    SILENT_REFERENCE,
-    Checks,
-    State,
-    checked_measurement,
-    restore,
-    run_or_undo,
-    state_of,
-    without_masked,
-)
+from . import checked_steps
 from .covariance import RandomWalkCovariance, require_covariance
 from .kfopc import KFOPC
 
@@ -135,7 +126,7 @@ class RandomWalkKFOPC(KFOPC):
         variance = as_nonnegative(initial_variance, "initial_variance")
         self._covariance = RandomWalkCovariance(variance * np.eye(n_taps))
 
-    def __getstate__(self) -> State:
+    def __getstate__(self) -> checked_steps.State:
         """Return the state for a deep copy or a file, without views (copied views would be writeable)."""
         attributes, private = super().__getstate__()
         return attributes, private | {"_views": {}}
@@ -300,17 +291,17 @@ class RandomWalkKFOPC(KFOPC):
 
     # The steps.
 
-    def _all_or_nothing(self, step: Callable[..., None], checks: Checks | None, *arguments: Any) -> None:
+    def _all_or_nothing(self, step: Callable[..., None], checks: checked_steps.Checks | None, *arguments: Any) -> None:
         """Run filterpy's own equations, which see P, F, Q as full arrays."""
         self._take_in_edits()
-        before = state_of(self)
+        before = checked_steps.state_of(self)
         try:
             self._replace_covariance(self._covariance.full(self._covariance.now))
             self._delegating = True
-            run_or_undo(self, step, arguments, checks)
+            checked_steps.run_or_undo(self, step, arguments, checks)
             self._delegating = False
         except BaseException:
-            restore(self, before)
+            checked_steps.restore(self, before)
             raise
 
     def predict(
@@ -344,7 +335,7 @@ class RandomWalkKFOPC(KFOPC):
     ) -> None:
         """Apply eq. 5-9; an H of several rows, or another `inv`, uses filterpy's own equations. See `KFOPC.update`."""
         if isinstance(z, np.ma.MaskedArray) and z.size == 1:  # several are left to `KFOPC.update`
-            z, R, H, _ = without_masked(self, z, R, H)
+            z, R, H, _ = checked_steps.without_masked(self, z, R, H)
         row: Any = self.H if H is None else H
         measurement: Any
         own_inverse = self.inv is not np.linalg.inv
@@ -371,7 +362,7 @@ class RandomWalkKFOPC(KFOPC):
     def _checked(self, z: Any, R: Any, row: Any) -> tuple[float, float, np.ndarray]:
         """Return z, R and H as numbers and (n,), or raise a clear error."""
         R = None if R is self._views.get("R") else R
-        z, _, _ = checked_measurement(self, z, R, row)
+        z, _, _ = checked_steps.checked_measurement(self, z, R, row)
         noise = self.measurement_noise if R is None else as_nonnegative(R, "R")
         return float(np.asarray(z).reshape(())), noise, np.array(row, dtype=np.float64).reshape(-1)
 
@@ -385,10 +376,10 @@ class RandomWalkKFOPC(KFOPC):
         seen.weights[:], seen.row[:] = x.reshape(-1), h
         if not isfinite(z + np.vdot(h, h) + np.vdot(seen.weights, seen.weights)):
             self._weights()  # raises if one of them is not finite
-            checked_measurement(self, z, None, h)
+            checked_steps.checked_measurement(self, z, None, h)
         factor = self._unconstrained_factor if constraint is None else constraint.preview(z, h[0], reference)
         if noise == 0.0 and not h.any():
-            raise ValueError(SILENT_REFERENCE)
+            raise ValueError(checked_steps.SILENT_REFERENCE)
         before, prior = covariance.before_update()
         result = covariance.arrays.result
         result[1] = nan

@@ -16,30 +16,10 @@ from .._types import PathModel
 from .._validate import as_positive, as_signal
 from ..bounds.rated_power import required_rated_power
 from ..bounds.wiener import WienerSolution
-from ..paths.analysis import (
-    STABILITY_BOUND_DEG,
-    CausalityMargin,
-    causality_margin,
-    energy_onset,
-    frequency_response,
-    group_delay,
-    phase_error,
-    secondary_path_gain,
-)
+from ..paths import analysis
 from ..paths.identification import IdentificationResult
 from ..paths.models import finite_taps, path_taps, sampling_rate
-from .style import (
-    MARK,
-    audible,
-    decibels,
-    frequency_axis,
-    labelled,
-    legend_above,
-    level_axis,
-    line_style,
-    new_axes,
-    phase_axis,
-)
+from . import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -112,21 +92,21 @@ def plot_bode(
     """
     named = _named(paths)
     frequencies = _grid(frequencies_hz, named, fs)
-    magnitude, phase = axes = np.asarray(new_axes(ax, rows=2))
+    magnitude, phase = axes = np.asarray(style.new_axes(ax, rows=2))
     powers = []
     for i, (label, path) in enumerate(named.items()):
-        response = frequency_response(path, frequencies, fs=fs)
+        response = analysis.frequency_response(path, frequencies, fs=fs)
         powers.append(np.abs(response) ** 2)
-        magnitude.plot(frequencies, decibels(powers[-1]), label=label, **line_style(i))
+        magnitude.plot(frequencies, style.decibels(powers[-1]), label=label, **style.line_style(i))
         taps = finite_taps(path)
-        delay = 0.0 if taps is None else energy_onset(taps) / sampling_rate(path, fs)
+        delay = 0.0 if taps is None else analysis.energy_onset(taps) / sampling_rate(path, fs)
         angle = np.rad2deg(np.unwrap(np.angle(response * np.exp(2j * np.pi * frequencies * delay))))
-        angle[~audible(response)] = np.nan
-        phase.plot(frequencies, angle, label=f"{label}, less {1e3 * delay:.2f} ms", **line_style(i))
-    level_axis(magnitude, powers, "Magnitude (dB)")
-    phase_axis(phase, "Phase less onset delay (degrees)")
-    frequency_axis(magnitude, frequencies).set_xlabel("")
-    frequency_axis(phase, frequencies)
+        angle[~style.audible(response)] = np.nan
+        phase.plot(frequencies, angle, label=f"{label}, less {1e3 * delay:.2f} ms", **style.line_style(i))
+    style.level_axis(magnitude, powers, "Magnitude (dB)")
+    style.phase_axis(phase, "Phase less onset delay (degrees)")
+    style.frequency_axis(magnitude, frequencies).set_xlabel("")
+    style.frequency_axis(phase, frequencies)
     return axes
 
 
@@ -164,12 +144,12 @@ def plot_impulse_responses(
     ('Time (ms)', ['P', 'S'])
     >>> plt.close(ax.figure)
     """
-    ax = new_axes(ax)
+    ax = style.new_axes(ax)
     for i, (label, path) in enumerate(_named(paths).items()):
         taps, rate = path_taps(path, name=label), sampling_rate(path, fs, name=label)
-        ax.plot(1e3 * np.arange(taps.size) / rate, taps, label=label, **line_style(i))
+        ax.plot(1e3 * np.arange(taps.size) / rate, taps, label=label, **style.line_style(i))
     ax.margins(x=0)
-    return labelled(ax, xlabel="Time (ms)", ylabel="Impulse response")
+    return style.labelled(ax, xlabel="Time (ms)", ylabel="Impulse response")
 
 
 def plot_group_delay(
@@ -210,13 +190,13 @@ def plot_group_delay(
     """
     named = _named(paths)
     frequencies = _grid(frequencies_hz, named, fs)
-    ax = new_axes(ax)
+    ax = style.new_axes(ax)
     for i, (label, path) in enumerate(named.items()):
-        heard = audible(frequency_response(path, frequencies, fs=fs))
-        delay = np.where(heard, group_delay(path, frequencies, fs=fs), np.nan)
-        ax.plot(frequencies, 1e3 * delay, label=label, **line_style(i))
+        heard = style.audible(analysis.frequency_response(path, frequencies, fs=fs))
+        delay = np.where(heard, analysis.group_delay(path, frequencies, fs=fs), np.nan)
+        ax.plot(frequencies, 1e3 * delay, label=label, **style.line_style(i))
     ax.set_ylabel("Group delay (ms)")
-    return frequency_axis(ax, frequencies)
+    return style.frequency_axis(ax, frequencies)
 
 
 def plot_causality_margin(
@@ -258,8 +238,8 @@ def plot_causality_margin(
     'margin 2.81 ms (45 samples)'
     >>> plt.close(ax.figure)
     """
-    margin = causality_margin(primary, secondary, fs=fs)
-    ax = new_axes(ax)
+    margin = analysis.causality_margin(primary, secondary, fs=fs)
+    ax = style.new_axes(ax)
     if np.ndim(margin.secondary_onset_s) == 2:
         _draw_margins(margin, ax)
     else:
@@ -267,14 +247,14 @@ def plot_causality_margin(
     return ax
 
 
-def _draw_onsets(margin: CausalityMargin, paths: Mapping[str, Any], ax: Axes) -> None:
+def _draw_onsets(margin: analysis.CausalityMargin, paths: Mapping[str, Any], ax: Axes) -> None:
     """Draw a primary and a secondary path with their onsets."""
     onsets = (1e3 * margin.primary_onset_s, 1e3 * margin.secondary_onset_s)
     for i, (label, path) in enumerate(paths.items()):
         taps = path_taps(path)
-        ax.plot(1e3 * np.arange(taps.size) / margin.fs, taps / np.abs(taps).max(), label=label, **line_style(i))
-        ax.axvline(onsets[i], color=line_style(i)["color"], linewidth=0.8)
-    ax.annotate("", (onsets[0], -1.2), (onsets[1], -1.2), arrowprops={"arrowstyle": "<->", "color": MARK})
+        ax.plot(1e3 * np.arange(taps.size) / margin.fs, taps / np.abs(taps).max(), label=label, **style.line_style(i))
+        ax.axvline(onsets[i], color=style.line_style(i)["color"], linewidth=0.8)
+    ax.annotate("", (onsets[0], -1.2), (onsets[1], -1.2), arrowprops={"arrowstyle": "<->", "color": style.MARK})
     ax.text(
         max(onsets),
         -1.2,
@@ -285,10 +265,10 @@ def _draw_onsets(margin: CausalityMargin, paths: Mapping[str, Any], ax: Axes) ->
     # The late reverberation does not affect the margin.
     ax.set_xlim(0, 2 * max(*onsets, 1e3 * margin.primary_delay_s, 1e3 * margin.secondary_delay_s))
     ax.set_ylim(-1.4, 1.15)
-    labelled(ax, xlabel="Time (ms)", ylabel="Impulse response / peak")
+    style.labelled(ax, xlabel="Time (ms)", ylabel="Impulse response / peak")
 
 
-def _draw_margins(margin: CausalityMargin, ax: Axes) -> None:
+def _draw_margins(margin: analysis.CausalityMargin, ax: Axes) -> None:
     """Draw the margins of all pairs as a table: blue is causal, red is not, grey is a silent path."""
     from matplotlib.patches import Rectangle
 
@@ -311,7 +291,7 @@ def _draw_margins(margin: CausalityMargin, ax: Axes) -> None:
     ax.set(xlabel="Loudspeaker (margins in ms)", ylabel="Microphone")
     ax.set_xticks(range(margins.shape[1]))
     ax.set_yticks(range(margins.shape[0]))
-    legend_above(ax)
+    style.legend_above(ax)
 
 
 def plot_secondary_path_gain(
@@ -359,19 +339,19 @@ def plot_secondary_path_gain(
     """
     frequencies = _grid(frequencies_hz, {"path": path}, fs)
     low, high = (0.0, sampling_rate(path, fs) / 2) if band is None else band
-    in_band = float(decibels(secondary_path_gain(path, band=(low, high), fs=fs)))
-    ax = new_axes(ax)
-    power = np.abs(frequency_response(path, frequencies, fs=fs)) ** 2
-    ax.plot(frequencies, decibels(power), label="$|S(f)|^2$", **line_style(0))
+    in_band = float(style.decibels(analysis.secondary_path_gain(path, band=(low, high), fs=fs)))
+    ax = style.new_axes(ax)
+    power = np.abs(analysis.frequency_response(path, frequencies, fs=fs)) ** 2
+    ax.plot(frequencies, style.decibels(power), label="$|S(f)|^2$", **style.line_style(0))
     ends = np.clip([low, high], frequencies[0], frequencies[-1])
-    ax.plot(ends, [in_band] * 2, label=f"$G_s$, {low:g} to {high:g} Hz: {in_band:.1f} dB", **line_style(1))
+    ax.plot(ends, [in_band] * 2, label=f"$G_s$, {low:g} to {high:g} Hz: {in_band:.1f} dB", **style.line_style(1))
     if reference is not None:
-        given = float(decibels(secondary_path_gain(path, reference=reference, fs=fs)))
-        ax.axhline(given, label=f"$G_s$, reference: {given:.1f} dB", **line_style(2))
+        given = float(style.decibels(analysis.secondary_path_gain(path, reference=reference, fs=fs)))
+        ax.axhline(given, label=f"$G_s$, reference: {given:.1f} dB", **style.line_style(2))
     if band is not None:
-        ax.axvspan(*ends, color=line_style(1)["color"], alpha=0.08, linewidth=0, label="Band of the white noise")
-    level_axis(ax, [power], "Power gain (dB)")
-    return frequency_axis(ax, frequencies)
+        ax.axvspan(*ends, color=style.line_style(1)["color"], alpha=0.08, linewidth=0, label="Band of the white noise")
+    style.level_axis(ax, [power], "Power gain (dB)")
+    return style.frequency_axis(ax, frequencies)
 
 
 def plot_phase_error(
@@ -419,20 +399,20 @@ def plot_phase_error(
     >>> plt.close(ax.figure)
     """
     frequencies = _grid(frequencies_hz, {"path": path}, fs)
-    silent = ~audible(frequency_response(path, frequencies, fs=fs))
-    ax = new_axes(ax)
+    silent = ~style.audible(analysis.frequency_response(path, frequencies, fs=fs))
+    ax = style.new_axes(ax)
     for i, (label, estimate) in enumerate(_named(estimates, "Estimate").items()):
-        error = phase_error(path, estimate, frequencies, fs=fs).error_deg
+        error = analysis.phase_error(path, estimate, frequencies, fs=fs).error_deg
         # Break the curve where it wraps from 180 to -180 degrees, and where the path is silent.
         wrapped = np.append(np.abs(np.diff(error)) > 180, False)
-        ax.plot(frequencies, np.where(wrapped | silent, np.nan, error), label=label, **line_style(i))
+        ax.plot(frequencies, np.where(wrapped | silent, np.nan, error), label=label, **style.line_style(i))
     for sign in (-1, 1):
-        bound = ax.axhline(sign * STABILITY_BOUND_DEG, color=MARK, linewidth=1, linestyle=(0, (1, 1)))
-        ax.axhspan(sign * STABILITY_BOUND_DEG, sign * 180, color=MARK, alpha=0.1, linewidth=0)
+        bound = ax.axhline(sign * analysis.STABILITY_BOUND_DEG, color=style.MARK, linewidth=1, linestyle=(0, (1, 1)))
+        ax.axhspan(sign * analysis.STABILITY_BOUND_DEG, sign * 180, color=style.MARK, alpha=0.1, linewidth=0)
     bound.set_label("Stability bound ±90°")
     ax.set_ylim(-180, 180)
-    phase_axis(ax, "Phase error (degrees)")
-    return frequency_axis(ax, frequencies)
+    style.phase_axis(ax, "Phase error (degrees)")
+    return style.frequency_axis(ax, frequencies)
 
 
 def plot_required_rated_power(
@@ -484,16 +464,16 @@ def plot_required_rated_power(
         control_power=solution.control_power,
         beyond="inf",
     )
-    ax = new_axes(ax)
+    ax = style.new_axes(ax)
     each = needed.rated_power.reshape(wanted.size, -1).T
     for j, powers in enumerate(each):
         label = "Wiener filter scaled by α" + (f", loudspeaker {j}" if len(each) > 1 else "")
-        ax.semilogy(wanted, np.where(powers > 0, powers, np.nan), label=label, **line_style(j))
-    ax.axvline(limit, label=f"Wiener filter unconstrained: {limit:.1f} dB", **line_style(len(each)))
+        ax.semilogy(wanted, np.where(powers > 0, powers, np.nan), label=label, **style.line_style(j))
+    ax.axvline(limit, label=f"Wiener filter unconstrained: {limit:.1f} dB", **style.line_style(len(each)))
     if marked is not None:
-        ax.axhline(marked, label=f"Rated power {marked:g}", **line_style(len(each) + 1))
+        ax.axhline(marked, label=f"Rated power {marked:g}", **style.line_style(len(each) + 1))
     ax.set_xlim(0, 1.05 * shown)
-    return labelled(ax, xlabel="Noise reduction (dB)", ylabel="Rated power needed (mean square)")
+    return style.labelled(ax, xlabel="Noise reduction (dB)", ylabel="Rated power needed (mean square)")
 
 
 def plot_modelling_error(
@@ -530,7 +510,7 @@ def plot_modelling_error(
     >>> plt.close(ax.figure)
     """
     named = _named(results, "Estimate")
-    ax = new_axes(ax)
+    ax = style.new_axes(ax)
     for i, (label, result) in enumerate(named.items()):
         if not isinstance(result, IdentificationResult):
             raise TypeError(f"results must hold IdentificationResult, got {type(result).__name__} for {label!r}")
@@ -540,6 +520,6 @@ def plot_modelling_error(
             text = f"{label}, {overall.size} paths: {overall.min():.1f} to {overall.max():.1f} dB overall"
         errors = np.reshape(result.modelling_error_db, (overall.size, -1))
         for n, error in enumerate(errors):
-            ax.plot(result.frequencies_hz, error, label=None if n else text, **line_style(i))
+            ax.plot(result.frequencies_hz, error, label=None if n else text, **style.line_style(i))
     ax.set_ylabel("Modelling error (dB)")
-    return frequency_axis(ax, np.concatenate([result.frequencies_hz for result in named.values()]))
+    return style.frequency_axis(ax, np.concatenate([result.frequencies_hz for result in named.values()]))
