@@ -69,16 +69,6 @@ def tone_source(rng: np.random.Generator) -> Take:
     return take
 
 
-def silence_source(rng: np.random.Generator) -> Take:
-    """Return a source of zeros."""
-    return np.zeros
-
-
-def white_source(rng: np.random.Generator) -> Take:
-    """Return a source of white noise of power 1."""
-    return rng.standard_normal
-
-
 def narrow_source(rng: np.random.Generator) -> Take:
     """Return a source of band-limited noise of power 1."""
     sos = butter(4, BAND_HZ, "bandpass", fs=FS, output="sos")
@@ -95,7 +85,7 @@ def narrow_source(rng: np.random.Generator) -> Take:
 
 def alternating_source(rng: np.random.Generator) -> Take:
     """Return a source of the other noises in turn, with jumps between them."""
-    turns = cycle([white_source(rng), silence_source(rng), narrow_source(rng), tone_source(rng)])
+    turns = cycle([rng.standard_normal, np.zeros, narrow_source(rng), tone_source(rng)])
     left = np.empty(0)
 
     def take(samples: int) -> np.ndarray:
@@ -112,8 +102,8 @@ def alternating_source(rng: np.random.Generator) -> Take:
 
 SOURCES: dict[str, Callable[[np.random.Generator], Take]] = {
     "tone": tone_source,
-    "silence": silence_source,
-    "white": white_source,
+    "silence": lambda rng: np.zeros,
+    "white": lambda rng: rng.standard_normal,  # of power 1
     "narrow band": narrow_source,
     "alternating": alternating_source,
 }
@@ -176,12 +166,8 @@ def all_cases() -> list[Case]:
         Case("KF-PB", partial(anc.kf_pb, TAPS, SECONDARY, **rated)),
         kalman_case("diagonal KF", anc.DiagonalKalman, 1e12),
         Case("KF-ANC, 2 x 2", partial(anc.kf_anc, TAPS // 2, paths, **zero), ratio=1e12, secondary=paths, share=0.1),
-        Case(
-            GROWING,
-            partial(array, initial_variance=1e4 * Q),
-            ratio=1e4,
-            signals=("tone", "silence", "white"),  # the others spoil an array that is never restarted
-        ),
+        # The other noises spoil an array that is never restarted.
+        Case(GROWING, partial(array, initial_variance=1e4 * Q), ratio=1e4, signals=("tone", "silence", "white")),
         *(Case(FINITE, partial(array, initial_variance=r * Q, memory=MEMORY), ratio=r) for r in (1e4, 1e12)),
         *(
             Case(name, partial(make, TAPS, SECONDARY, step_size=1e-3, **settings), quiet=name != "clipping FxLMS")
@@ -365,17 +351,10 @@ def table(outcomes: Sequence[Outcome]) -> str:
         own = [one for one in outcomes if (one.name, one.ratio) == key]
         reached = {one.signal: f"{one.noise_reduction_db:.1f}" for one in own}
         with_P = [one.least_eigenvalue for one in own if not np.isnan(one.least_eigenvalue)]
-        rows.append(
-            [
-                key[0],
-                "-" if key[1] is None else f"{key[1]:.0e}",
-                *(reached.get(name, "-") for name in noises),
-                f"{min(with_P):.1e}" if with_P else "-",
-                f"{max(one.growth_mb for one in own):.1f}",
-                f"{min(one.us_per_sample for one in own):.2f}",
-                str(sum(len(one.violations) for one in own)),
-            ]
-        )
+        line = [key[0], "-" if key[1] is None else f"{key[1]:.0e}", *(reached.get(name, "-") for name in noises)]
+        line += [f"{min(with_P):.1e}" if with_P else "-", f"{max(one.growth_mb for one in own):.1f}"]
+        line += [f"{min(one.us_per_sample for one in own):.2f}", str(sum(len(one.violations) for one in own))]
+        rows.append(line)
     return "\n".join(aligned(rows, left={0}))
 
 
@@ -386,33 +365,26 @@ def remarks(outcomes: Sequence[Outcome]) -> list[str]:
     growing, finite = (
         min([one.us_per_sample for one in arrays if one.name == name], default=np.nan) for name in ARRAYS
     )
-    return [
+    lines = [
         f"{len(outcomes)} runs of {longest:,} samples (several channels: a tenth), {CHECKS} checks in each, "
         f"{TAPS} taps, no state noise, q = {Q:g}. dB: noise reduction in the last interval; least/largest: eigenvalues of "
-        "P, the worst of all checks; MB: growth of the process; us: time of a sample, the least of the noises.",
-        *(
-            [f"A finite memory of {MEMORY} takes {finite / growing:.1f} times as long as one fast array."]
-            if growing > 0.0 < finite
-            else []
-        ),
-        *(
-            f"{one.name}, P0/q = {one.ratio:.0e}, {one.signal}: largest stray of the arrays {one.stray:.1e}, "
-            f"{one.arrays_lost} arrays lost and restarted."
-            for one in arrays
-        ),
-        *(
-            f"VIOLATION: {one.name}, {one.signal}, by sample {sample:,}: {what}."
-            for one in outcomes
-            for sample, what in one.violations
-        ),
+        "P, the worst of all checks; MB: growth of the process; us: time of a sample, the least of the noises."
     ]
+    if growing > 0.0 < finite:
+        lines.append(f"A finite memory of {MEMORY} takes {finite / growing:.1f} times as long as one fast array.")
+    lines += [
+        f"{one.name}, P0/q = {one.ratio:.0e}, {one.signal}: largest stray of the arrays {one.stray:.1e}, "
+        f"{one.arrays_lost} arrays lost and restarted."
+        for one in arrays
+    ]
+    violations = ((one, sample, what) for one in outcomes for sample, what in one.violations)
+    return lines + [f"VIOLATION: {one.name}, {one.signal}, by sample {n:,}: {what}." for one, n, what in violations]
 
 
 def main(arguments: Sequence[str]) -> int:
     """Soak the controllers that the command line names; return 1 if anything was violated."""
-    parser = argparse.ArgumentParser(
-        prog="python -m comparisons soak", description="Run the controllers for very long, and watch them."
-    )
+    about = "Run the controllers for very long, and watch them."
+    parser = argparse.ArgumentParser(prog="python -m comparisons soak", description=about)
     parser.add_argument("--samples", type=float, default=SAMPLES, help="of a run (default: 1e7)")
     parser.add_argument("--only", metavar="NAME", help="controllers whose name fits, such as 'KF-*' (default: all)")
     parser.add_argument("--output", type=Path, default=Path("soak"), help="folder to write into (default: soak)")
@@ -423,9 +395,8 @@ def main(arguments: Sequence[str]) -> int:
         parser.error(f"--samples must be {100 * CHECKS} at least, got {options.samples:g}")
     cases = [case for case in all_cases() if options.only is None or fnmatch(case.name, options.only)]
     if not cases:
-        parser.error(
-            f"no controller fits {options.only}; there are {', '.join(dict.fromkeys(c.name for c in all_cases()))}"
-        )
+        known = ", ".join(dict.fromkeys(case.name for case in all_cases()))
+        parser.error(f"no controller fits {options.only}; there are {known}")
 
     from tqdm import tqdm
 
@@ -444,11 +415,8 @@ def main(arguments: Sequence[str]) -> int:
             print(f"interrupted after {len(outcomes)} of {len(runs)} runs")
     if not outcomes:
         return INTERRUPTED
-    print(
-        table(outcomes), "", *(fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(outcomes)), sep="\n"
-    )
-    violated = sum(bool(one.violations) for one in outcomes)
-    print(
-        f"\n{violated} of {len(outcomes)} runs violated a promise; {time.process_time() - began:.0f} s of CPU; {written}"
-    )
+    lines = (fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(outcomes))
+    print(table(outcomes), "", *lines, sep="\n")
+    violated, took = sum(bool(one.violations) for one in outcomes), time.process_time() - began
+    print(f"\n{violated} of {len(outcomes)} runs violated a promise; {took:.0f} s of CPU; {written}")
     return 1 if violated else 0 if len(outcomes) == len(runs) else INTERRUPTED

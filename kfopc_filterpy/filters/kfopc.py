@@ -562,34 +562,18 @@ class KFOPC(KalmanFilter, Checkpointed):
     def __repr__(self) -> str:
         if self.dim_x > MOST_STATES_SHOWN:
             return f"<{type(self).__name__}: {', '.join(self._summary())}>"
-        constraint = [
-            f"{name} = {getattr(self, name)}"
-            for name in ("rated_power", "constraint_factor", "disturbance_power", "secondary_path_gain")
-        ]
-        return "\n".join(
-            [super().__repr__().replace("KalmanFilter object", f"{type(self).__name__} object"), *constraint]
-        )
+        own = ("rated_power", "constraint_factor", "disturbance_power", "secondary_path_gain")
+        parts = [super().__repr__().replace("KalmanFilter object", f"{type(self).__name__} object")]
+        return "\n".join([*parts, *(f"{name} = {getattr(self, name)}" for name in own)])
 
     def _summary(self) -> list[str]:
         """Return the parts of the `repr` of a filter with many states."""
-        return [
-            f"dim_x {self.dim_x}",
-            f"dim_z {self.dim_z}",
-            *self._noises(),
-            *self._power_settings(),
-            f"constraint factor {self.constraint_factor:.3g}",
-            f"norm of x {np.linalg.norm(self.x):.3g}",
-        ]
-
-    def _power_settings(self) -> list[str]:
-        """Return the rated power for the summary, and the settings of the constraint that keeps it."""
-        if self.rated_power is None:
-            return []
-        parts = ["rated power " + ", ".join(f"{power:g}" for power in np.ravel(self.rated_power))]
+        parts = [f"dim_x {self.dim_x}", f"dim_z {self.dim_z}", *self._noises()]
         if self._constraint is not None:
             first = self._constraint[0] if isinstance(self._constraint, tuple) else self._constraint
-            parts += [f"fs {first.fs:g} Hz", f"memory {first.memory_s:g} s"]
-        return parts
+            powers = ", ".join(f"{power:g}" for power in np.ravel(self._constraint.rated_power))
+            parts += [f"rated power {powers}", f"fs {first.fs:g} Hz", f"memory {first.memory_s:g} s"]
+        return [*parts, f"constraint factor {self.constraint_factor:.3g}", f"norm of x {np.linalg.norm(self.x):.3g}"]
 
     def _noises(self) -> list[str]:
         """Return the noise variances for the summary, if they are single numbers."""
@@ -650,9 +634,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         shared: Any = self._constraint if isinstance(self._constraint, tuple) else SharedConstraint([self._constraint])
         rows = np.reshape(H, (-1, self.dim_x))
         if len(rows) != self.dim_z:
-            raise ValueError(
-                f"a rated power needs all measurements at once, dim_z = {self.dim_z} rows of H, got {len(rows)}"
-            )
+            raise ValueError(f"a rated power needs all dim_z = {self.dim_z} measurements, rows of H, got {len(rows)}")
         filters = len(shared), 1 if reference is None else np.size(reference)
         if self.dim_x % (filters[0] * filters[1]):
             raise ValueError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
 from typing import Any
@@ -25,9 +24,7 @@ from .health import Health
 
 ACTIONS = ("mute", "reset", "freeze")
 LONGEST_PAUSE = 64  # of the first pause
-OVER_POWER = (
-    4.0  # times the rated power over a window: no algorithm here exceeds its rating so much, except in its first blocks
-)
+OVER_POWER = 4.0  # times the rated power over a window: no algorithm exceeds its rating so much after its first blocks
 PATIENCE = 3  # windows in a row that must be too loud: after a jump of the noise, the power needs some time
 OFTEN_LIMITED = 0.1  # of a window's samples at the limit
 SURPRISE = 1e4  # squared innovation over its predicted variance, relative to what is usual: 40 dB
@@ -300,17 +297,15 @@ class Supervisor(Checkpointed):
         """Return copies of references (I, n) and errors (K, n); what is missing is NaN."""
         if references is None and errors is None:
             raise ValueError("references or errors must be given: without both, the length of the block is not known")
-        x = None if references is None else _channels(references, self.n_references, "references")
-        e = None if errors is None else _channels(errors, self.n_microphones, "errors")
-        lengths = {block.shape[1] for block in (x, e) if block is not None}
+        given = {"references": (references, self.n_references), "errors": (errors, self.n_microphones)}
+        read = {name: _channels(block, n, name) for name, (block, n) in given.items() if block is not None}
+        lengths = {block.shape[1] for block in read.values()}
         if len(lengths) != 1 or 0 in lengths:
-            raise ValueError(
-                "references and errors must have the same number of samples, at least 1, got "
-                f"{' and '.join(str(length) for length in sorted(lengths))}"
-            )
-        n = lengths.pop()
-        missing_x, missing_e = (np.full((channels, n), np.nan) for channels in (self.n_references, self.n_microphones))
-        return missing_x if x is None else x, missing_e if e is None else e
+            found = " and ".join(map(str, sorted(lengths)))
+            raise ValueError(f"references and errors must have the same number of samples, at least 1, got {found}")
+        length = lengths.pop()
+        x, e = (read.get(name, np.full((n, length), np.nan)) for name, (_, n) in given.items())
+        return x, e
 
     def _usable(self, x: np.ndarray, e: np.ndarray) -> np.ndarray:
         """Return which samples can be learned from, (n,); bad ones are replaced in place and noted."""
@@ -396,17 +391,13 @@ class Supervisor(Checkpointed):
     def _adapted(self, x: np.ndarray, e: np.ndarray, adapt: np.ndarray) -> np.ndarray:
         """Return the controller's outputs, (J, n); a sample that it refuses is counted, and the rest goes on."""
         y, begin, n, refusals = np.zeros((self.n_loudspeakers, x.shape[1])), 0, x.shape[1], 0
-        process: Callable[..., Any] = getattr(self.controller, "process", None) or partial(
-            process_steps, self.controller
-        )
+        process: Any = getattr(self.controller, "process", None) or partial(process_steps, self.controller)
         with np.errstate(over="ignore", invalid="ignore"):
             while begin < n:
-                rest = slice(begin, n)
                 room = np.zeros((self.n_loudspeakers, n - begin))
                 try:
-                    process(
-                        self._shaped(x[:, rest]), self._shaped(e[:, rest]), adapt=adapt[rest], out=self._shaped(room)
-                    )
+                    signals = (self._shaped(signal[:, begin:]) for signal in (x, e))
+                    process(*signals, adapt=adapt[begin:], out=self._shaped(room))
                     done = n - begin
                 except RefusedUpdate as refused:
                     done = refused.sample + 1
