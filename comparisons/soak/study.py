@@ -85,7 +85,7 @@ def narrow_source(rng: np.random.Generator) -> Take:
 
 def alternating_source(rng: np.random.Generator) -> Take:
     """Return a source of the other noises in turn, with jumps between them."""
-    turns = cycle([rng.standard_normal, np.zeros, narrow_source(rng), tone_source(rng)])
+    turns: Iterator[Take] = cycle([rng.standard_normal, np.zeros, narrow_source(rng), tone_source(rng)])
     left = np.empty(0)
 
     def take(samples: int) -> np.ndarray:

@@ -379,12 +379,8 @@ def _figures() -> tuple[dict[str, Any], dict[str, Any]]:
 def _texts() -> dict[str, Any]:
     from bokeh.models import Div
 
-    options: dict[str, dict[str, Any]] = {
-        "status": {"styles": {"color": "#555555"}},
-        "summary": {"min_height": 66},
-        "sounds": {},
-    }
-    return {name: Div(name=name, text="", width=2 * WIDTH, **own) for name, own in options.items()}
+    options: dict[str, dict[str, Any]] = {"status": {"styles": {"color": "#555555"}}, "summary": {"min_height": 66}}
+    return {name: Div(name=name, text="", width=2 * WIDTH, **options.get(name, {})) for name in (*options, "sounds")}
 
 
 def _players(result: ExploreResult) -> str:

@@ -96,15 +96,9 @@ class FixedFilters:
         """
         if noise_reduction_db <= 0:
             return np.zeros(np.shape(rated_power))[()]
+        plant, proportions = (self.x, self.d, self.s, self.n_taps), rated_power if self.several else None
         found = budgeted_rated_power(
-            noise_reduction_db,
-            self.x,
-            self.d,
-            self.s,
-            self.n_taps,
-            fs=self.fs,
-            proportions=rated_power if self.several else None,
-            beyond="inf",
+            noise_reduction_db, *plant, fs=self.fs, proportions=proportions, beyond="inf"
         ).rated_power
         return found if self.several else float(found)
 

@@ -113,25 +113,17 @@ def _like(limits: Limits, each: Sequence[OutputLimits]) -> Limits:
 
 def scaled(limits: Limits, share: float) -> Limits:
     """Return limits with `share` times the rated powers, and peaks in proportion."""
-    return _like(
-        limits,
-        [
-            replace(
-                one,
-                rated_power=share * one.rated_power,
-                amplitude_limit=one.amplitude_limit and float(np.sqrt(share)) * one.amplitude_limit,
-            )
-            for one in each_of(limits)
-        ],
-    )
+    root, each = float(np.sqrt(share)), each_of(limits)
+    peaks = [one.amplitude_limit and root * one.amplitude_limit for one in each]
+    powers = [share * one.rated_power for one in each]
+    pairs = zip(each, powers, peaks, strict=True)
+    return _like(limits, [replace(one, rated_power=power, amplitude_limit=peak) for one, power, peak in pairs])
 
 
 def amplifiers(limits: Limits) -> Amplifier | Sequence[Amplifier]:
     """Return the amplifier that clips at the limit, or a list with one for each loudspeaker."""
-    each = [
-        LinearAmplifier() if one.amplitude_limit is None else HardClipAmplifier(one.amplitude_limit)
-        for one in each_of(limits)
-    ]
+    peaks = (one.amplitude_limit for one in each_of(limits))
+    each = [LinearAmplifier() if peak is None else HardClipAmplifier(peak) for peak in peaks]
     return each if isinstance(limits, ChannelLimits) else each[0]
 
 
@@ -200,9 +192,8 @@ def scale_of(ratings: Sequence[Sequence[Rating]], name: str, several: bool) -> N
 
     None if a loudspeaker has no such rating, or a curve instead of a number.
     """
-    found: list[Any] = [
-        next((getattr(one, name) for one in own if hasattr(one, "volts_per_unit")), None) for own in ratings
-    ]
+    with_volts = ([one for one in own if hasattr(one, "volts_per_unit")] for own in ratings)
+    found: list[Any] = [getattr(own[0], name) if own else None for own in with_volts]
     if not several:
         return found[0]
     return np.array(found, dtype=float) if all(np.ndim(one) == 0 and one is not None for one in found) else None

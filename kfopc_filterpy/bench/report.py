@@ -179,13 +179,9 @@ def _on_a_screen(study: StudyReport) -> list[Table]:
 def aligned(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
     """Return lines of cells in columns; the columns `left` are aligned to the left."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return [
-        "  ".join(
-            cell.ljust(width) if i in left else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    sides = ["<" if i in left else ">" for i in range(len(widths))]
+    line = "  ".join(f"{{:{side}{width}}}" for side, width in zip(sides, widths, strict=True))
+    return [line.format(*row).rstrip() for row in rows]
 
 
 def _write_csv(path: Path, table: Table) -> None:

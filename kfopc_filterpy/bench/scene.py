@@ -214,16 +214,9 @@ class Scene:
         return simulate_scenarios(controllers, self.references[seed_index], **self._options(seed_index) | options)
 
     def _options(self, seed_index: int) -> dict[str, Any]:
-        return {
-            "disturbance": self.disturbances[seed_index],
-            "secondary_path": self.secondary,
-            "fs": self.fs,
-            "rated_power": self.rated_power,
-            "amplifier": self.amplifier,
-            "sensor_noise_std": self.sensor_noise_std,
-            "rng": self.sensor_noise_seeds[seed_index],
-            "switch_on_s": self.switch_on_s,
-        }
+        names = ("fs", "rated_power", "amplifier", "sensor_noise_std", "switch_on_s")
+        own = {"disturbance": self.disturbances[seed_index], "rng": self.sensor_noise_seeds[seed_index]}
+        return {**own, "secondary_path": self.secondary, **{name: getattr(self, name) for name in names}}
 
 
 def make_scene(

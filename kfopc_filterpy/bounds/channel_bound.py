@@ -128,11 +128,8 @@ class ChannelCorrelations:
         else:
             missed = float(np.max(np.where(penalty > 0.0, np.abs(ratio - 1.0), ratio - 1.0)))
             if missed > MISSED:
-                warnings.warn(
-                    f"the rated powers are met to {100 * missed:.2g} % only: the bound is not exact",
-                    RuntimeWarning,
-                    stacklevel=2,
-                )
+                text = f"the rated powers are met to {100 * missed:.2g} % only: the bound is not exact"
+                warnings.warn(text, RuntimeWarning, stacklevel=2)
         return weights, penalty
 
     def _newton_step(self, factors: Any, weights: np.ndarray, rated_power: np.ndarray, free: np.ndarray) -> np.ndarray:

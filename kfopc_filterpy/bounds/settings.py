@@ -61,11 +61,7 @@ class SuggestedSettings:
     @property
     def settings(self) -> dict[str, float]:
         """Keyword arguments r, q and P0 of a filter: ``KFOPC.random_walk(s.n_taps, **s.settings)``."""
-        return {
-            "state_noise": self.state_noise,
-            "measurement_noise": self.measurement_noise,
-            "initial_variance": self.initial_variance,
-        }
+        return {name: getattr(self, name) for name in ("state_noise", "measurement_noise", "initial_variance")}
 
     def __repr__(self) -> str:
         values = ", ".join(f"{name}={value:.3g}" for name, value in self.settings.items())

@@ -90,12 +90,9 @@ class Exported:
 
     def examples(self) -> dict[str, str]:
         """Return an example of a program and a page about the export, by the names of the files."""
-        page = {
-            "operations": operations(self.block),
-            "worst": worst(self.block),
-            "dtype": self.block.algorithm.precision,
-        }
-        return {"main.c": self.filled("example.c"), "README.md": self.filled("example.md", **page)}
+        cost = {"operations": operations(self.block), "worst": worst(self.block)}
+        page = self.filled("example.md", **cost, dtype=self.block.algorithm.precision)
+        return {"main.c": self.filled("example.c"), "README.md": page}
 
     def _header(self) -> dict[str, Any]:
         arrays, name = self.multichannel, self.name

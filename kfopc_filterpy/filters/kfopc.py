@@ -210,14 +210,12 @@ class KFOPC(KalmanFilter, Checkpointed):
         """
         from .random_walk import RandomWalkKFOPC
 
-        return RandomWalkKFOPC(
-            n_taps,
-            state_noise=state_noise,
-            measurement_noise=measurement_noise,
-            initial_variance=initial_variance,
-            rated_power=rated_power,
-            constraint=constraint,
-        )
+        noises = {
+            "state_noise": state_noise,
+            "measurement_noise": measurement_noise,
+            "initial_variance": initial_variance,
+        }
+        return RandomWalkKFOPC(n_taps, **noises, rated_power=rated_power, constraint=constraint)
 
     # The constraint: its values can be read, or supplied by the caller.
 

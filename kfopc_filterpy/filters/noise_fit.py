@@ -179,15 +179,8 @@ def fit_noise(
             "values; give fewer parts, or a longer record"
         )
     errors[found] = factors[found] * np.sqrt(np.sum(vectors**2 / curvatures, axis=1))
-    return NoiseFit(
-        factors[:n_q],
-        factors[n_q:],
-        errors[:n_q],
-        errors[n_q:],
-        Q_fixed + np.tensordot(factors[:n_q], Q_matrices, 1),
-        R_fixed + np.tensordot(factors[n_q:], R_matrices, 1),
-        float(value),
-    )
+    Q, R = Q_fixed + np.tensordot(factors[:n_q], Q_matrices, 1), R_fixed + np.tensordot(factors[n_q:], R_matrices, 1)
+    return NoiseFit(factors[:n_q], factors[n_q:], errors[:n_q], errors[n_q:], Q, R, float(value))
 
 
 class _Record:

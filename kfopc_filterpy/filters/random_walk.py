@@ -87,18 +87,8 @@ class RandomWalkKFOPC(KFOPC):
 
     if not TYPE_CHECKING:  # Out of `Saver`'s records, filterpy's own private attributes included.
         __slots__ = (
-            "_F",
-            "_K",
-            "_Q",
-            "_alpha_sq",
-            "_covariance",
-            "_delegating",
-            "_likelihood",
-            "_log_likelihood",
-            "_made",
-            "_mahalanobis",
-            "_numbers",
-            "_views",
+            *("_F", "_K", "_Q", "_alpha_sq", "_covariance", "_delegating", "_likelihood", "_log_likelihood", "_made"),
+            *("_mahalanobis", "_numbers", "_views"),
         )
 
     def __init__(

@@ -431,15 +431,11 @@ def identify_secondary_path(
     if frequencies_hz is None:
         frequencies_hz = np.arange(1, 257) * 0.45 * fs / 256
     found = fitted.taps.reshape(K, J, -1)
-    errors = np.array(
-        [[modelling_error_db(true[k, j], found[k, j], frequencies_hz, fs=fs) for j in range(J)] for k in range(K)]
-    )
-    misalignments = np.array([[misalignment_db(true[k, j], found[k, j]) for j in range(J)] for k in range(K)])
+    pairs = [(true[k, j], found[k, j]) for k in range(K) for j in range(J)]
+    errors = np.reshape([modelling_error_db(*pair, frequencies_hz, fs=fs) for pair in pairs], (K, J, -1))
+    misalignments = np.reshape([misalignment_db(*pair) for pair in pairs], (K, J))
     return IdentificationResult(
-        estimate=fitted.estimate,
-        taps=fitted.taps,
-        residual_db=fitted.residual_db,
-        uncertainty=fitted.uncertainty,
+        **vars(fitted),
         frequencies_hz=as_signal(frequencies_hz, "frequencies_hz"),
         modelling_error_db=errors if several else errors[0, 0],
         misalignment_db=misalignments if several else float(misalignments[0, 0]),

@@ -255,13 +255,8 @@ def _draw_onsets(margin: analysis.CausalityMargin, paths: Mapping[str, Any], ax:
         ax.plot(1e3 * np.arange(taps.size) / margin.fs, taps / np.abs(taps).max(), label=label, **style.line_style(i))
         ax.axvline(onsets[i], color=style.line_style(i)["color"], linewidth=0.8)
     ax.annotate("", (onsets[0], -1.2), (onsets[1], -1.2), arrowprops={"arrowstyle": "<->", "color": style.MARK})
-    ax.text(
-        max(onsets),
-        -1.2,
-        f"  margin {1e3 * margin.margin_s:.2f} ms ({margin.margin_samples:.0f} samples)",
-        va="center",
-        bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
-    )
+    text = f"  margin {1e3 * margin.margin_s:.2f} ms ({margin.margin_samples:.0f} samples)"
+    ax.text(max(onsets), -1.2, text, va="center", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0})
     # The late reverberation does not affect the margin.
     ax.set_xlim(0, 2 * max(*onsets, 1e3 * margin.primary_delay_s, 1e3 * margin.secondary_delay_s))
     ax.set_ylim(-1.4, 1.15)
@@ -282,12 +277,9 @@ def _draw_margins(margin: analysis.CausalityMargin, ax: Axes) -> None:
     for (k, j), value in np.ndenumerate(margins):
         ax.text(j, k, f"{value:.2f}" if heard[k, j] else "silent", ha="center", va="center", fontsize="small")
     k, j = margin.deciding_pair
-    ax.add_patch(
-        Rectangle(
-            (j - 0.5, k - 0.5), 1, 1, fill=False, edgecolor="black", linewidth=2, clip_on=False,
-            label=f"margin of the whole: {1e3 * margin.margin_s:.2f} ms ({margin.margin_samples:.0f} samples)",
-        )
-    )  # fmt: skip
+    label = f"margin of the whole: {1e3 * margin.margin_s:.2f} ms ({margin.margin_samples:.0f} samples)"
+    frame: dict[str, Any] = {"fill": False, "edgecolor": "black", "linewidth": 2, "clip_on": False}
+    ax.add_patch(Rectangle((j - 0.5, k - 0.5), 1, 1, **frame, label=label))
     ax.set(xlabel="Loudspeaker (margins in ms)", ylabel="Microphone")
     ax.set_xticks(range(margins.shape[1]))
     ax.set_yticks(range(margins.shape[0]))
@@ -457,13 +449,9 @@ def plot_required_rated_power(
     limit = solution.noise_reduction_db
     shown = min(limit, 60.0)  # a noiseless tone can be cancelled to rounding
     wanted = np.linspace(0.02, 0.999, 400) * shown
-    needed = required_rated_power(
-        wanted,
-        disturbance_power=solution.disturbance_power,
-        antinoise_power=min(solution.antinoise_power, solution.disturbance_power),
-        control_power=solution.control_power,
-        beyond="inf",
-    )
+    known = {name: getattr(solution, name) for name in ("disturbance_power", "control_power")}
+    known["antinoise_power"] = min(solution.antinoise_power, solution.disturbance_power)
+    needed = required_rated_power(wanted, **known, beyond="inf")
     ax = style.new_axes(ax)
     each = needed.rated_power.reshape(wanted.size, -1).T
     for j, powers in enumerate(each):

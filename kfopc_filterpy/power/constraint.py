@@ -93,13 +93,11 @@ class OutputPowerConstraint:
 
     def fresh(self, rated_power: float | None = None) -> OutputPowerConstraint:
         """Return a constraint with the same settings and no samples yet; `rated_power` replaces the rated power."""
-        return OutputPowerConstraint(
+        rated, own = (
             self.rated_power if rated_power is None else rated_power,
-            secondary_path_gain=self._given_gain,
-            fs=self.fs,
-            memory_s=self.memory_s,
-            window=self.window,
+            {"fs": self.fs, "memory_s": self.memory_s},
         )
+        return OutputPowerConstraint(rated, secondary_path_gain=self._given_gain, window=self.window, **own)
 
     @property
     def state(self) -> ConstraintState:
@@ -220,11 +218,8 @@ class OutputPowerConstraint:
 
     @staticmethod
     def _squares(disturbance: Any, filtered: Any, reference: Any) -> tuple[float, float, float | None]:
-        return (
-            squared(disturbance, "the measurement"),
-            squared(filtered, "the newest filtered reference"),
-            None if reference is None else squared(reference, "reference"),
-        )
+        x_squared = None if reference is None else squared(reference, "reference")
+        return squared(disturbance, "the measurement"), squared(filtered, "the newest filtered reference"), x_squared
 
     def _read(self, name: str) -> float:
         supplied = self._state.numbers[f"supplied_{name}"][0]

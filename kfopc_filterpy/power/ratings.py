@@ -371,12 +371,8 @@ def output_limits(rating: Rating | Sequence[Rating]) -> OutputLimits:
     if not math.isfinite(least.rated_power):
         raise ValueError("rating must limit the mean power: give watts, peak volts or a rated power")
     peaks = [limits.amplitude_limit for limits in each if limits.amplitude_limit is not None]
-    return OutputLimits(
-        least.rated_power,
-        min(peaks, default=None),
-        min(limits.window_s for limits in each),
-        least.decided_by,
-    )
+    peak, window_s = min(peaks, default=None), min(limits.window_s for limits in each)
+    return OutputLimits(least.rated_power, peak, window_s, least.decided_by)
 
 
 def _limits(rating: Any) -> OutputLimits:

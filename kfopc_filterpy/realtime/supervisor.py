@@ -159,15 +159,9 @@ class Supervisor(Checkpointed):
         self.on_divergence = as_choice(on_divergence, "on_divergence", ACTIONS)
         self.largest_gain = as_positive(largest_gain, "largest_gain")
         self.recovery_samples = _remembered(controller)
-        self._inspectors = [
-            Inspector(
-                n,
-                most_equal=as_sample_count(stuck_s, fs, "stuck_s"),
-                rate=1.0 / (0.1 * self.fs),
-                full_scale=np.inf if full_scale is None else as_positive(full_scale, "full_scale"),
-            )
-            for n in (self.n_references, self.n_microphones)
-        ]
+        limits: dict[str, Any] = {"most_equal": as_sample_count(stuck_s, fs, "stuck_s"), "rate": 1.0 / (0.1 * self.fs)}
+        limits["full_scale"] = np.inf if full_scale is None else as_positive(full_scale, "full_scale")
+        self._inspectors = [Inspector(n, **limits) for n in (self.n_references, self.n_microphones)]
         self.health = Health()
         self._fresh = deepcopy(controller)
         self._good = self._fresh if on_divergence == "freeze" else None  # state of the last good window
