@@ -29,10 +29,8 @@ POWER_WINDOW_S = 0.05
 POWER_EVERY_S = 0.01
 SEGMENT_S = 0.064  # of the spectra
 ROUNDING = 1e-12
-SIGNALS = {  # of a run, with the names of their powers in an `ExploreResult`
-    **{"disturbance": "disturbance_power", "error": "error_power"},
-    **{"control_signal": "asked_power", "amplifier_output": "delivered_power"},
-}
+SIGNALS = ("disturbance", "error", "control_signal", "amplifier_output")  # of a run
+POWERS = ("disturbance_power", "error_power", "asked_power", "delivered_power")  # of these signals
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,7 +382,7 @@ def explore(setup: AcousticSetup, settings: ExploreSettings | None = None) -> Ex
     frequencies, of_disturbance = power_spectrum_db(run.disturbance, run.fs, segment_s=SEGMENT_S)
     shown = slice(round(POWER_WINDOW_S * run.fs) - 1, None, round(POWER_EVERY_S * run.fs))  # from the first full window
     signals: dict[str, Any] = {name: getattr(run, name) for name in SIGNALS}
-    powers = {SIGNALS[name]: short_time_power(own, run.fs, POWER_WINDOW_S)[shown] for name, own in signals.items()}
+    short_time = (short_time_power(signal, run.fs, POWER_WINDOW_S)[shown] for signal in signals.values())
     return ExploreResult(
         settings=settings,
         fs=run.fs,
@@ -395,7 +393,7 @@ def explore(setup: AcousticSetup, settings: ExploreSettings | None = None) -> Ex
         disturbance_spectrum_db=of_disturbance,
         error_spectrum_db=power_spectrum_db(run.error, run.fs, segment_s=SEGMENT_S)[1],
         time_s=run.time_s[shown],
-        **powers,
+        **dict(zip(POWERS, short_time, strict=True)),
         noise_reduction_db=noise_reduction_db(run.error, run.disturbance),
         output_power=output_power(run.control_signal),
         clipped_fraction=clipped_fraction(run.control_signal, scene.amplitude_limit),

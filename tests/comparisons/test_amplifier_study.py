@@ -27,8 +27,8 @@ def small() -> Any:
     short = short_duct()
     studied = [Case("duct", "tone", "hard clip"), Case("duct", "band noise", "soft saturation")]
     constants = {"ALGORITHMS": STUDIED, "OVERDRIVES_DB": (0.0, 10.0), "DURATION_S": 2.0}
-    own = {"ducts": lambda: short, "cases": lambda names: studied, "PEAK_LIMITED": ("clipping FxLMS",)}
-    with smaller(cases, N_TAPS=TAPS), smaller(amplifier, **constants, **own):
+    own = {"all_cases": lambda names: studied, "PEAK_LIMITED": ("clipping FxLMS",)}
+    with smaller(cases, N_TAPS=TAPS, ducts=lambda: short), smaller(amplifier, **constants, **own):
         return *run_study(amplifier), cases.driven_case(short["duct"], cases.noise_of("tone", 2.0), 0.0)
 
 
