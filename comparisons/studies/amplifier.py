@@ -86,9 +86,8 @@ def main(runs: Runs) -> StudyReport:
         name="amplifier",
         title="An amplifier that saturates",
         summary=(
-            "A tone and a band noise that ask for up to 20 dB more than the rated power, and an amplifier that puts out "
-            "sqrt(2 rated power) at most, the peak of a sine of rated power: a hard clip, and a soft saturation (Rapp, p = 2). "
-            "Settings are tuned again at every overdrive."
+            "A tone and a band noise that ask for up to 20 dB more than the rated power, and an amplifier, hard clip or soft "
+            "saturation (Rapp, p = 2), that puts out sqrt(2 rated power) at most. Settings are tuned at every overdrive."
         ),
         fs=FS,
         rated_power=1.0,
@@ -307,8 +306,7 @@ def amplifier_figures(rows: Sequence[AmplifierRow]) -> list[FigureItem]:
         parts.legend_of(figure, [axes[0, 0]])
         caption = (
             f"{', '.join(case).capitalize()}. Above: the disturbance estimate does not know the amplifier; below: it does, if "
-            "it can. Black crosses: the filter overruns. A gap: it diverged. Output power is before the amplifier. "
-            f"Noise reductions above {TOP_DB:g} dB, at 0 dB of overdrive, are off the scale."
+            "it can. Black crosses: the filter overruns. A gap: it diverged. Output power is before the amplifier."
         )
         items.append(FigureItem("-".join(case).replace(" ", "-"), caption, figure))
     return items

@@ -73,9 +73,8 @@ def main(runs: Runs) -> StudyReport:
         name="broadband",
         title="Broadband noise and a linear amplifier",
         summary=(
-            f"Noise from {BAND[0]:g} to {BAND[1]:g} Hz needs {POWER_MULTIPLE:g} times the rated power of "
-            f"{RATED_POWER:g}. The amplifier is linear, as the paper's must be for its KF-ANC to have the best noise "
-            "reduction; runs with a clipping amplifier stand beside it."
+            f"Noise from {BAND[0]:g} to {BAND[1]:g} Hz needs {POWER_MULTIPLE:g} times the rated power of {RATED_POWER:g}. "
+            "The amplifier is linear, as the paper's must be; runs with a clipping amplifier stand beside it."
         ),
         fs=FS,
         rated_power=RATED_POWER,
@@ -111,7 +110,7 @@ def main(runs: Runs) -> StudyReport:
         ],
         figures=_figures_of(results, weight_errors, clipped, clipped_scene),
         sounds=parts.sounds({name: rows[0] for name, rows in results.items()}),
-        notes=[*parts.tuning_note(tuned), parts.ceiling_note(scene), _length_note(times, other)],
+        notes=[*parts.tuning_note(tuned), parts.ceiling_note(scene)],
     )
 
 
@@ -279,15 +278,7 @@ def _or_never(time_s: float | None) -> float:
     return np.inf if time_s is None or np.isnan(time_s) else time_s
 
 
-# ---- Notes and figures
-
-
-def _length_note(times_s: Mapping[str, float | None], other_s: Mapping[str, float | None]) -> str:
-    here, there = ("; ".join(f"{name} {milliseconds(t)}" for name, t in own.items()) for own in (times_s, other_s))
-    return (
-        f"Convergence of the NSE depends on the length of the control filter. {N_TAPS} taps: {here}. {OTHER_N_TAPS} taps, tuned "
-        f"again: {there}."
-    )
+# ---- Figures
 
 
 def _draw_weight_errors(ax: Any, curves: Mapping[str, np.ndarray]) -> None:
@@ -312,8 +303,7 @@ def _figures_of(
         ),
         parts.draw(
             "a-weight-error",
-            "Error of the weights, weighted by the filtered reference, over the anti-noise of each algorithm's own steady "
-            f"solution, mean over {len(SEEDS)} seeds. Unlike the NSE it does not depend on how low an algorithm settles.",
+            f"Error of the weights, weighted by x', over each algorithm's own steady solution, mean over {len(SEEDS)} seeds.",
             lambda ax: _draw_weight_errors(ax, weight_errors),
         ),
         parts.draw(
@@ -328,9 +318,7 @@ def _figures_of(
         ),
         parts.draw(
             "clipped-nse",
-            f"Normalised squared error over 50 ms with an amplifier that clips at {clipped_scene.amplitude_limit:.3f}, "
-            f"pooled over {len(SEEDS)} seeds. Up to 50 ms the mean is over the time since switch-on, so the start still "
-            "counts; beyond it drops out, hence the bend there.",
+            f"Normalised squared error over 50 ms with an amplifier that clips at {clipped_scene.amplitude_limit:.3f}.",
             lambda ax: plot_nse(clipped, window_s=0.05, time_axis="log", ax=ax),
         ),
     ]

@@ -100,9 +100,8 @@ def main(runs: Runs) -> StudyReport:
         name="constraint",
         title="The constraint that holds",
         summary=(
-            "The power-budgeted Kalman filter (KF-PB) and KF-OPC, as published and with its gain repaired, against the "
-            "power-constrained Wiener solution, on modelled and real paths. The rated power is a share of what the "
-            "unconstrained control filter of each noise would need."
+            "KF-PB and KF-OPC, as published and with its gain repaired, against the power-constrained Wiener solution, on "
+            "modelled and real paths. The rated power is a share of what full control of each noise would need."
         ),
         fs=FS,
         rated_power=SHARES[0],
@@ -315,7 +314,6 @@ def _cases_figure(rows: Sequence[ConstraintRow]) -> FigureItem:
     parts.legend_of(figure, axes[0])
     return FigureItem(
         "cases",
-        f"Noise reduction below the bound, the power-constrained Wiener solution, and output power (rated power "
-        f"{100 * SHARES[0]:.0f} %, {shortest:g} s, all seeds). KF-OPC can lie above the bound if it overspends.",
+        f"Noise reduction below the bound, and output power ({100 * SHARES[0]:.0f} %, {shortest:g} s, all seeds).",
         figure,
     )

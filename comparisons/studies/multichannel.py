@@ -63,12 +63,11 @@ def names(place: Place) -> list[str]:
 
 def coarse_grids(place: Place) -> dict[str, list[Setting]]:
     """Return the settings to try first: of grids of two settings every second value, since a finer grid follows."""
-    registry = algorithms(several_channels=True)
-    return {
-        name: [(one, two) for one in registry[name].first[::2] for two in registry[name].second[::2]]
-        or registry[name].grid
-        for name in names(place)
+    registry = {name: algorithms()[name] for name in names(place)}
+    pairs: dict[str, list[Setting]] = {
+        name: [(one, two) for one in own.first[::2] for two in own.second[::2]] for name, own in registry.items()
     }
+    return {name: pairs[name] or own.grid for name, own in registry.items()}
 
 
 def planned_runs() -> int:
@@ -106,10 +105,9 @@ def main(runs: Runs) -> StudyReport | str:
         name="multichannel",
         title="Several loudspeakers, a rated power for each",
         summary=(
-            "Noise reduction over all microphones and power of each loudspeaker, for every algorithm that takes "
-            "several channels, each at its best setting, and for the power-constrained Wiener solution. Each "
-            f"loudspeaker's rated power is {rooms.RATED_SHARE:g} of the power that it would use without a limit; the "
-            "tables also have a case with one equal rating for all."
+            "Noise reduction over all microphones and power of each loudspeaker, for every algorithm that takes several "
+            "channels, each at its best setting, and for the power-constrained Wiener solution. Each rated power is "
+            f"{rooms.RATED_SHARE:g} of what the loudspeaker would use without a limit; the tables also have equal ratings."
         ),
         fs=rooms.FS,
         rated_power=1.0,
@@ -141,15 +139,11 @@ def place_rows(path: str, noise: str, scene: Scene, tuned: Mapping[str, Tuned], 
     """Return the rows of a place and noise; those with one equal rating are of the bounds and of KF-PB."""
     equal, place = equally_rated(scene), {"path": path, "noise": noise}
     repeated = bench.run_setting(equal, KF_PB, tuned[KF_PB].setting)
-    return [
-        *_bound_rows(scene, **place),
-        *(
-            channel_row(scene, results.get(own), **place, algorithm=own, setting=best.setting)
-            for own, best in tuned.items()
-        ),
-        *_bound_rows(equal, **place, rating=EQUAL),
-        channel_row(equal, repeated, **place, rating=EQUAL, algorithm=KF_PB),
-    ]
+    rows = _bound_rows(scene, **place)
+    for own, best in tuned.items():
+        rows.append(channel_row(scene, results.get(own), **place, algorithm=own, setting=best.setting))
+    rows += _bound_rows(equal, **place, rating=EQUAL)
+    return [*rows, channel_row(equal, repeated, **place, rating=EQUAL, algorithm=KF_PB)]
 
 
 def channel_row(scene: Scene, result: SimulationResult | None, **place: Any) -> ChannelRow:
@@ -260,10 +254,8 @@ def _rivals(rows: Sequence[ChannelRow]) -> list[ChannelRow]:
 
 def _notes(tuned: Mapping[str, Mapping[str, Tuned]]) -> list[str]:
     notes = [
-        f"{' and '.join(DIRECT)} run only in systems of up to {MOST_WEIGHTS} weights. In larger ones, the scaled Wiener "
-        "solution stands for KF-OPC: it is what KF-OPC would reach if its factor kept the ratings.",
-        f"'{FREE}' has a small ridge: directions of the weights in which the noise has hardly any energy are left out. "
-        "For recordings, the bound and the scaled solution have one filter per second.",
+        f"{' and '.join(DIRECT)} run only in systems of up to {MOST_WEIGHTS} weights; in larger ones, the scaled Wiener "
+        "solution stands for KF-OPC. For recordings, the bound and the scaled solution have one filter per second.",
     ]
     if set(places()) <= {MEASURED}:
         notes.append("pyroomacoustics is not installed: the built-in rooms are left out.")
@@ -336,15 +328,12 @@ def _course_figure(rows: Sequence[ChannelRow], results: Results) -> FigureItem:
         axes[0, 0].axhline(-reached[name], color=parts.MARK, linestyle=dashes, linewidth=1, label=name)
     axes[0, 0].legend(fontsize="small")
     caption = (
-        f"Built-in room, {', '.join(SHOWN)}: the error over time, over all microphones ({NSE_WINDOW_S:g} s), with the "
-        "bound within the ratings and the scaled solution."
+        f"Built-in room, {', '.join(SHOWN)}: the error of all microphones over time, the bound and the scaled solution."
     )
     return FigureItem("course", caption, figure)
 
 
 def _sounds(results: Results, heard: Sequence[str]) -> list[Sound]:
     off = Sound("off", "First microphone, control off", results[KF_PB].disturbance[0], group="room")
-    return [off] + [
-        Sound(f"run-{k}", f"First microphone, {name}", results[name].error[0], group="room")
-        for k, name in enumerate(heard)
-    ]
+    errors = enumerate((f"First microphone, {name}", results[name].error[0]) for name in heard)
+    return [off, *(Sound(f"run-{k}", label, error, group="room") for k, (label, error) in errors)]

@@ -80,9 +80,8 @@ def main(runs: Runs) -> StudyReport:
         title="What a rated power buys",
         summary=(
             "Noise reduction and output power of every algorithm, each at its best setting for each rated power, and of "
-            "the power-constrained Wiener solution, which no fixed filter of that length can pass within the rated power. "
-            "If the level varies, `bound` keeps the rated power in each second, and `bound of the record` over the record. "
-            "The rated power is in dB over what the unconstrained control filter of the noise would need."
+            "the power-constrained Wiener solution. If the level varies, `bound` keeps the rated power in each second, and "
+            "`bound of the record` over the record. The rated power is in dB over what full control would need."
         ),
         fs=FS,
         rated_power=1.0,
@@ -216,10 +215,8 @@ def _notes(tuned: Mapping[Case, TunedAt]) -> list[str]:
         own = [best[name] for shares in tuned.values() for best in shares.values()]
         unfinished = [best for best in own if _slowest(name, best)]
         if unfinished and algorithm.keeps_budget:
-            notes.append(
-                f"{name} has the least step size of its grid in {len(unfinished)} of {len(own)} points: there it keeps its budget "
-                "by not having converged, no step size at which it has keeps it."
-            )
+            where = f"{len(unfinished)} of {len(own)} points"
+            notes.append(f"{name} has its grid's least step size in {where}: there it keeps its budget unconverged.")
     return notes
 
 
@@ -237,8 +234,7 @@ def _table(means: Means) -> Table:
     headings += [f"{share:g} dB" for share in SHARES_DB] + [f"power at {share:g} dB" for share in SHARES_DB]
     return Table(
         "reduction",
-        "Noise reduction in dB over the steady half and output power over the rated one, means over seeds, at each rated "
-        "power in dB over the unconstrained one",
+        "Noise reduction in dB over the steady half and output power over the rated one, means over seeds",
         headings,
         [
             [case.path, case.noise, name, *column(own, "noise_reduction_db"), *column(own, "power")]

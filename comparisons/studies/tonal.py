@@ -267,8 +267,7 @@ def _figures_of(
     return [
         parts.draw(
             "a-error-spectra",
-            "Power spectra of disturbance and error signals over the steady half (Fig. 5 a). At 400 Hz KF-ANC lies behind "
-            "KF-OPC.",
+            "Power spectra of disturbance and errors over the steady half (Fig. 5 a). At 400 Hz KF-ANC lies behind KF-OPC.",
             lambda ax: plot.plot_error_spectra(pair, ax=ax),
         ),
         parts.draw(
