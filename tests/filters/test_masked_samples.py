@@ -61,13 +61,6 @@ def test_masked_samples_are_missing_with_references(kind: str, behind: float, sh
     require_same_run(kf, other, masked(z, behind), by_hand(z), Hs=list(ROWS), references=REFERENCES)
 
 
-@pytest.mark.parametrize("kind", ["general", "random walk"])
-@pytest.mark.parametrize("update_first", [False, True])
-def test_masked_samples_are_missing_without_references(kind: str, update_first: bool) -> None:
-    kf, other = MAKERS[kind](), MAKERS[kind]()
-    require_same_run(kf, other, masked(Z), by_hand(Z), Hs=list(ROWS), update_first=update_first)
-
-
 def test_a_list_may_hold_masked_samples() -> None:
     kf, other = MAKERS["general"](), MAKERS["general"]()
     zs = [np.ma.masked if z is None else np.ma.array([z]) for z in by_hand(Z)]
@@ -81,13 +74,6 @@ def test_a_masked_array_without_a_masked_sample() -> None:
     for f in (kf, other):
         f.H = np.eye(2, N)
     require_same_run(kf, other, np.ma.array(Z.reshape(-1, 2)), Z.reshape(-1, 2))
-
-
-def test_a_batch_of_masked_samples_only_is_a_prediction() -> None:
-    kf = KFOPC(N)  # no H is needed
-    means, covariances, _, _ = kf.batch_filter(np.ma.masked_all(3))
-    assert not means.any()
-    np.testing.assert_array_equal(covariances[-1], 4.0 * np.eye(N))
 
 
 # Some components of a measurement

@@ -98,45 +98,6 @@ def test_the_noises_are_at_the_peak_of_the_joint_density(case):
     assert_allclose([fit.state_noise_errors[0], fit.measurement_noise_errors[0]], errors, rtol=1e-3)
 
 
-@pytest.mark.parametrize("missing", [0.0, 0.2])
-@pytest.mark.parametrize("make", [local_level, constant_velocity])
-def test_statsmodels_finds_the_same_noises_errors_and_likelihood(make, missing):
-    """statsmodels' likelihood at our factors is ours to rounding; its own search (BFGS) stops within about 1e-4 of a
-    standard error, and its information matrix, by complex steps, agrees with ours to the 1e-6 of our differences."""
-    models = pytest.importorskip("statsmodels.tsa.statespace.mlemodel", reason="needs statsmodels (the extra `bench`)")
-    kf = make()
-    z = drawn(kf, 0.4, 3.0, 300, seed=7, missing=missing)
-
-    class Model(models.MLEModel):
-        start_params = (1.0, 1.0)
-        param_names = ("q", "r")
-
-        def __init__(self):
-            super().__init__(np.ma.filled(z, np.nan), k_states=kf.dim_x, k_posdef=kf.dim_x)
-            self["design"], self["transition"], self["selection"] = kf.H, kf.F, np.eye(kf.dim_x)
-
-        def transform_params(self, free):
-            return np.exp(free)
-
-        def untransform_params(self, factors):
-            return np.log(factors)
-
-        def update(self, params, **kwargs):
-            q, r = super().update(params, **kwargs)
-            self["state_cov"], self["obs_cov"] = q * kf.Q, r * kf.R
-            self.ssm.initialize_known(np.zeros(kf.dim_x), kf.F @ kf.P @ kf.F.T + q * kf.Q)
-
-    fit, model = fit_noise(kf, z), Model()
-    model.ssm.tolerance = 0  # its filter must not stop at a gain that is only nearly steady
-    factors = np.array([fit.state_noise[0], fit.measurement_noise[0]])
-    errors = np.array([fit.state_noise_errors[0], fit.measurement_noise_errors[0]])
-    assert_allclose(fit.log_likelihood, model.loglike(factors), rtol=1e-10)
-    theirs = model.fit(disp=False, cov_type="none", method="bfgs", gtol=1e-6, maxiter=500)
-    assert np.all(np.abs(theirs.params - factors) < 1e-3 * errors)
-    information = -model.hessian(factors) * len(z)
-    assert_allclose(errors, np.sqrt(np.diag(np.linalg.inv(information))), rtol=1e-4)
-
-
 def test_a_random_walk_without_measurement_noise_has_the_closed_form():
     """The steps are then measured themselves: q is their mean square, with the standard error q sqrt(2/N)."""
     kf = local_level()
@@ -177,15 +138,6 @@ def test_an_observation_that_changes_with_time_is_used():
     fit = fit_noise(kf, z, H=H)
     assert_allclose(fit.log_likelihood, log_density(kf, z, fit.Q, fit.R, H), rtol=1e-9)
     assert abs(fit_noise(kf, z).log_likelihood - fit.log_likelihood) > 1
-
-
-def test_the_random_walk_of_a_control_filter_is_a_model_like_others():
-    kf = KFOPC.random_walk(3, state_noise=0.01, measurement_noise=0.2)
-    H = np.random.default_rng(2).standard_normal((70, 1, 3))
-    z = drawn(kf, 1.0, 1.0, 70, seed=8, H=H)
-    fit = fit_noise(kf, z, H=H)
-    assert_allclose(fit.log_likelihood, log_density(kf, z, fit.Q, fit.R, H), rtol=1e-9)
-    assert_allclose(fit.Q, fit.state_noise[0] * 0.01 * np.eye(3))
 
 
 def test_the_scale_of_the_parts_does_not_matter():

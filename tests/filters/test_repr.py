@@ -12,11 +12,6 @@ from kfopc_filterpy import KFOPC, OutputPowerConstraint
 NOISES: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 0.1}
 
 
-def test_the_general_filter() -> None:
-    kf = KFOPC(dim_x=100, dim_z=2)
-    assert repr(kf) == "<KFOPC: dim_x 100, dim_z 2, constraint factor 1, norm of x 0>"
-
-
 @pytest.mark.parametrize("column", [True, False])
 def test_the_random_walk_filter(column: bool) -> None:
     kf = KFOPC.random_walk(

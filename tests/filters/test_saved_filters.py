@@ -88,10 +88,3 @@ def test_arrays_of_a_file_can_be_written_into_but_views_that_only_show_cannot(tm
     assert not loaded.Q.flags.writeable
     assert loaded.B.flags.writeable
     assert loaded.x.flags.writeable
-
-
-def test_a_loaded_covariance_begins_at_a_cache_line_again(tmp_path: Path) -> None:
-    kf = KFOPC.random_walk(128, state_noise=1e-6, measurement_noise=0.1)
-    kf.save(tmp_path / "filter.kfopc")
-    memory = KFOPC.load(tmp_path / "filter.kfopc")._covariance.arrays.memory
-    assert memory.ctypes.data % 64 == 0
