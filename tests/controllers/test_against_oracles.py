@@ -261,7 +261,7 @@ def test_kalman_with_a_guard(name: str, scene: Scene) -> None:
     compare(scene, controller, oracle, 2000)
 
 
-@pytest.mark.parametrize(("name", "scene"), kalman_cases(["KF-ANC", "KF-OPC", "repaired", "fast array"]))
+@pytest.mark.parametrize(("name", "scene"), kalman_cases(["KF-ANC", "KF-OPC", "FxRLS", "repaired", "fast array"]))
 def test_kalman_with_limiters(name: str, scene: Scene) -> None:
     own, theirs = limiters(scene)
     compare(scene, *pair(name, scene, {"limiter": own}, {"limiters": theirs}), 2000)
@@ -269,7 +269,7 @@ def test_kalman_with_limiters(name: str, scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "scene"), kalman_cases(["KF-OPC", "diagonal KF-OPC", "repaired", "fast array KF-OPC"])
+    ("name", "scene"), kalman_cases(["KF-OPC", "diagonal KF-OPC", "FxRLS", "repaired", "fast array KF-OPC"])
 )
 def test_kalman_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> None:
     own, known = saturating(scene)

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 
-from kfopc_filterpy import DiagonalKalman, OutputPowerConstraint, kf_anc, kf_opc, simulate
+from kfopc_filterpy import DiagonalKalman, kf_anc, simulate
 
 L = 6
 PATH = np.array([0.0, 0.8, -0.3])
@@ -19,35 +18,6 @@ def signals(n: int = 400, colour: tuple[float, ...] = (1.0,)) -> tuple[np.ndarra
     x, other = np.random.default_rng(5).standard_normal((2, n))
     x = np.convolve(x, colour)[:n]
     return x, np.convolve(x, [0.0, 0.0, 1.2, 0.5])[:n] + 0.1 * other
-
-
-@pytest.mark.parametrize("constrained", [False, True])
-def test_it_is_filterpys_filter_with_the_diagonal_of_p(constrained: bool) -> None:
-    """filterpy's predict and update, P cut to its diagonal after each; the factors are those of a KF-OPC beside it.
-
-    Known path: d^ = d. Tolerance: rounding of filterpy's Joseph form.
-    """
-    x, d = signals()
-    rated: dict[str, Any] = {"constraint": OutputPowerConstraint(0.3, memory_s=0.01)} if constrained else {}
-    controller = DiagonalKalman(L, PATH, **NOISES, **rated)
-    result = simulate(controller, x, disturbance=d, secondary_path=PATH, record_weights_every=1)
-    factors = np.ones(x.size)
-    if constrained:
-        factors = simulate(kf_opc(L, PATH, **NOISES, **rated), x, disturbance=d, secondary_path=PATH).constraint_factor
-        np.testing.assert_allclose(result.constraint_factor, factors, rtol=1e-9)
-        assert np.min(factors) < 0.8
-    kf = KalmanFilter(dim_x=L, dim_z=1)
-    kf.x, kf.P, kf.Q, kf.R = np.zeros((L, 1)), 0.7 * np.eye(L), 1e-5 * np.eye(L), np.array([[0.02]])
-    xf = np.r_[np.zeros(L - 1), np.convolve(x, PATH)[: x.size]]
-    for n in range(x.size):
-        kf.predict()
-        kf.update(factors[n] * d[n], H=xf[n : n + L][::-1][None])
-        kf.P = np.diag(np.diag(kf.P))
-        assert result.weights is not None
-        np.testing.assert_allclose(result.weights[n], kf.x[:, 0], rtol=0, atol=1e-10)
-    np.testing.assert_allclose(controller.variances, np.diag(kf.P), rtol=1e-9)
-    assert result.algorithm == ("diagonal KF-OPC" if constrained else "diagonal KF")
-    assert controller.rated_power == (0.3 if constrained else None)
 
 
 def test_what_it_loses_against_the_full_filter() -> None:

@@ -8,7 +8,6 @@ from typing import Any
 import control
 import numpy as np
 import pytest
-import scipy.linalg
 from helpers.comparing import assert_same_run
 
 from kfopc_filterpy import (
@@ -39,7 +38,6 @@ PATHS[:, :, 1:5] = _rng.standard_normal((K, J, 4)) * [0.8, 0.5, 0.3, 0.2]
 ESTIMATE = 0.9 * PATHS[:, :, :4]  # what the controllers know of them
 PRIMARY = _rng.standard_normal((K, I, 7)) * 0.5
 A = np.array([0.3, 0.6])  # amplitude limits
-PENALTY = np.array([0.7, 0.2])
 RATED, MEMORY = np.array([0.4, 0.8]), 60
 
 
@@ -110,34 +108,6 @@ def test_one_loudspeaker_is_the_single_channel_bit_for_bit(name: str, loudspeake
     assert got.algorithm == want.algorithm
 
 
-def test_each_loudspeaker_has_its_own_limiter_and_amplifier_model() -> None:
-    """Two loudspeakers that do not hear each other are two single-channel runs."""
-    x = noise(600, 1)
-    paths = np.zeros((2, 2, 4))
-    paths[0, 0], paths[1, 1] = ONE_PATH, 0.5 * ONE_PATH[::-1]
-    d = np.array([np.convolve(x[0], [0.0, 0.0, 0.0, 0.0, 1.2, 0.5])[:600], np.roll(x[0], 4)])
-    amplifiers = [HardClipAmplifier(0.2), HardClipAmplifier(0.3)]
-
-    def limiters() -> list[OutputLimiter]:
-        return [OutputLimiter(power, fs=FS, window_s=20 / FS) for power in (0.02, 0.05)]
-
-    def controller(path: np.ndarray, penalty: Any, amplifier: Any, limiter: Any) -> MOVFxLMS:
-        options: dict[str, Any] = {"rated_power": 1.0, "penalty_factor": penalty, "modified": True}
-        return MOVFxLMS(L, path, step_size=MU, amplifier=amplifier, limiter=limiter, **options)
-
-    both = controller(paths, PENALTY, amplifiers, limiters())
-    np.testing.assert_array_equal(both.rated_power, [1.0, 1.0])
-    both.limiter = limiters()  # can be assigned
-    got = simulate(both, x, disturbance=d, secondary_path=paths, amplifier=amplifiers, fs=FS, rated_power=1.0)
-    for j, limiter in enumerate(limiters()):
-        one = controller(paths[j, j], PENALTY[j], amplifiers[j], limiter)
-        options = {"secondary_path": paths[j, j], "amplifier": amplifiers[j], "fs": FS, "rated_power": 1.0}
-        want = simulate(one, x[0], disturbance=d[j], **options)
-        np.testing.assert_allclose(got.control_signal[j], want.control_signal, rtol=0, atol=1e-12)
-        assert limiter.clipped + (limiter.gain < 1.0) > 0  # it did limit
-        assert np.abs(want.control_signal - want.amplifier_output).max() > 0.01  # and the amplifier clipped
-
-
 # ---- Loudspeakers and microphones that are not what they should be
 
 
@@ -177,41 +147,6 @@ def test_identical_loudspeakers_share_the_work_of_one(difference: float) -> None
 
 
 # ---- Where it settles
-
-
-def wiener(paths: np.ndarray, primary: np.ndarray, leak: np.ndarray) -> np.ndarray:
-    """Return the solution of (R + diag(leak_j)) w = r for white references of power 1, from dense convolutions."""
-    n_k, n_j, _ = paths.shape
-    rows = paths.shape[2] + L - 1
-    columns = [[scipy.linalg.convolution_matrix(paths[k, j], L, mode="full") for j in range(n_j)] for k in range(n_k)]
-    A_ = np.block(columns)  # (K rows, J L): what each tap of each loudspeaker adds at each lag and microphone
-    solutions = []
-    for i in range(primary.shape[1]):
-        b = np.concatenate([np.pad(primary[k, i], (0, rows - primary.shape[2])) for k in range(n_k)])
-        w = np.linalg.solve(A_.T @ A_ + np.diag(np.repeat(leak, L)), A_.T @ b)
-        solutions.append(w.reshape(n_j, L))
-    return np.stack(solutions, axis=1)
-
-
-@pytest.mark.parametrize(
-    ("make", "leak"),
-    [
-        (lambda **o: FxLMS(L, PATHS, step_size=1e-3, **o), [0.0, 0.0]),
-        (lambda **o: LeakyFxLMS(L, PATHS, step_size=1e-3, leak=[0.8, 0.3], **o), [0.8, 0.3]),
-        (lambda **o: LeakyFxLMS(L, PATHS, step_size=1e-3, leak=0.5, **o), [0.5, 0.5]),
-        (lambda **o: MOVFxLMS(L, PATHS, step_size=1e-3, rated_power=1.0, penalty_factor=[0.8, 0.3], **o), [0.8, 0.3]),
-    ],
-    ids=["FxLMS", "leaks", "one leak", "penalties"],
-)
-def test_it_settles_at_the_regularised_wiener_solution(make: Callable[..., Any], leak: list[float]) -> None:
-    """The mean of the weights, within 1 % of the largest one. R_x = I, so a penalty is a leak."""
-    x = noise(200_000)
-    result = run(make(n_references=I), x, record_weights_every=50)
-    weights = result.weights[len(result.weights) // 4 :].mean(axis=0)
-    want = wiener(PATHS, PRIMARY, np.array(leak))
-    np.testing.assert_allclose(weights, want, rtol=0, atol=0.01 * np.abs(want).max())
-    if any(leak):  # the leak matters at that tolerance
-        assert np.abs(want - wiener(PATHS, PRIMARY, np.zeros(J))).max() > 0.05 * np.abs(want).max()
 
 
 def test_a_normalised_step_does_not_depend_on_the_level_and_is_stable_up_to_2() -> None:
@@ -275,23 +210,18 @@ def test_several_references_need_no_channel_axes() -> None:
         (lambda: FxLMS(L, np.ones((64, 2, 3)), step_size=MU), ValueError, r"taps come last"),
         (lambda: FxLMS(L, PATHS * np.nan, step_size=MU), ValueError, r"secondary_path must be finite"),
         (lambda: FxLMS(L, PATHS, step_size=MU, n_references=0), ValueError, "n_references must be at least 1"),
-        (lambda: FxLMS(L, PATHS, step_size=-1.0), ValueError, "step_size must be greater than 0"),
-        (lambda: FxLMS(L, PATHS, step_size=MU, limiter=OutputLimiter(1.0)), TypeError, "2 different OutputLimiters"),
         (lambda: FxLMS(L, PATHS, step_size=MU, limiter=[OutputLimiter(1.0)] * 2), TypeError, "2 different OutputLimiters"),
         (lambda: made("clipping FxLMS", ESTIMATE[:, :1]), ValueError, r"one for each of the 1 loudspeakers, \(1,\), got shape \(2,\)"),
         (lambda: ClippingFxLMS(L, PATHS, step_size=MU, amplitude_limit=[1.0, 0.0]), ValueError, "amplitude_limit must be greater than 0"),
-        (lambda: LeakyFxLMS(L, PATHS, step_size=0.1, leak=[1.0, -1.0]), ValueError, "leak must not be negative"),
         (lambda: LeakyFxLMS(L, PATHS, step_size=0.1, leak=[1.0, 11.0]), ValueError, r"step_size \* leak must be 1 at most, got 1.1"),
         (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=[1.0] * 3), ValueError, "one for each of the 2 loudspeakers, got 3"),
         (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=1.0, amplifier=[None]), TypeError, "each of the 2 loudspeakers"),
-        (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=1.0, penalty_factor=np.nan), ValueError, "penalty_factor must be finite"),
         (lambda: MOVFxLMS(L, ONE_PATH, step_size=MU, rated_power=[1.0, 2.0]), ValueError, "must be one for one loudspeaker, got 2"),
-        (lambda: FxNLMS(L, PATHS, step_size=MU, regularization=0.0), ValueError, "regularization must be greater than 0"),
         (lambda: fx_rls(L, PATHS), ValueError, "fx_rls takes one channel, .* use kf_pb, .* FxNLMS"),
         (lambda: KalmanController(KFOPC(L), PATHS), ValueError, "KalmanController takes one channel"),
         (lambda: FastArrayKalman(L, PATHS, measurement_noise=1.0), ValueError, "FastArrayKalman takes one channel: .* with the setting n_references take several"),
     ],
-    ids=range(19),
+    ids=range(14),
 )  # fmt: skip
 def test_settings_that_do_not_fit_are_refused(make: Callable[[], Any], error: type, message: str) -> None:
     with pytest.raises(error, match=message):
@@ -301,10 +231,7 @@ def test_settings_that_do_not_fit_are_refused(make: Callable[[], Any], error: ty
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda c: c.update([0.1, np.nan, 0.2]), "error must be finite, but that of microphone 1 is nan"),
         (lambda c: c.update([0.1, 0.2]), "error must have a value for each of the 3 microphones, got 2"),
-        (lambda c: c.update([0.1, 0.2, 1e200]), "error is too loud"),
-        (lambda c: c.control_signal([np.inf, 1.0]), "reference must be finite, but that of reference 0 is inf"),
         (lambda c: c.control_signal(1.0), "reference must have a value for each of the 2 references, got 1"),
         (lambda c: c.listen(np.ones((1, 9)), np.ones((3, 9))), "with I = 2, K = 3, got"),
         (lambda c: c.listen(np.ones((2, 9)), np.ones((3, 8))), "with I = 2, K = 3, got"),
@@ -314,7 +241,7 @@ def test_settings_that_do_not_fit_are_refused(make: Callable[[], Any], error: ty
             "made for 3 microphones, but reference and paths of the run have 2",
         ),
     ],
-    ids=range(9),
+    ids=range(6),
 )
 def test_signals_that_do_not_fit_are_refused_with_nothing_changed(call: Callable[[Any], Any], message: str) -> None:
     refusing, twin = made("MOV-FxLMS"), made("MOV-FxLMS")
@@ -323,14 +250,6 @@ def test_signals_that_do_not_fit_are_refused_with_nothing_changed(call: Callable
     with pytest.raises(ValueError, match=message):
         call(refusing)
     assert_same_run(run(refusing, noise(20)), run(twin, noise(20)))
-
-
-def test_an_overflow_in_a_run_names_the_sample() -> None:
-    d = np.ones((K, 50))
-    d[2, 30] = 1e200
-    with pytest.raises(ValueError, match="error is too loud") as refused:
-        simulate(made("FxLMS"), noise(50), disturbance=d, secondary_path=PATHS, fs=FS)
-    assert any("sample 30" in note for note in refused.value.__notes__)
 
 
 def test_one_channel_refuses_arrays_and_several_channels_need_paths_with_axes() -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.channels import random_paths
-from helpers.comparing import assert_same_run
 from scipy.signal import butter, lfilter
 
 from kfopc_filterpy import (
@@ -85,14 +83,6 @@ def test_a_setting_that_is_out_of_range_is_refused_by_name(settings: dict, error
         made(**settings)
 
 
-def test_rated_powers_must_fit_the_loudspeakers() -> None:
-    with pytest.raises(ValueError, match="each of the 2 loudspeakers"):
-        several(rated_power=[1.0, 1.0, 1.0])
-    with pytest.raises(ValueError, match="rated_power must be greater than 0"):
-        several(rated_power=[1.0, -1.0])
-    np.testing.assert_array_equal(several(rated_power=0.1).rated_power, [0.1, 0.1])
-
-
 def test_another_sample_rate_than_that_of_the_run_is_refused() -> None:
     with pytest.raises(ValueError, match="fs is 4000 Hz but the controller's power memory is for 2000 Hz"):
         run(made(), noise(0.1), fs=4000.0)
@@ -110,13 +100,6 @@ def test_the_spread_is_the_rms_of_the_error_over_the_spectrum_of_the_path() -> N
     expected = np.linalg.norm(other - S) / np.linalg.norm(S)
     assert rms_relative_error(other[np.newaxis], S) == pytest.approx(expected, rel=1e-6)
     assert rms_relative_error(np.full(257, 0.3), PATHS) == pytest.approx(0.3)
-
-
-def test_the_uncertainty_is_kept_as_it_was_stated_and_cannot_be_changed() -> None:
-    controller = made(secondary_path_uncertainty=PathTolerance(phase_deg=10.0))
-    assert controller.secondary_path_uncertainty == PathTolerance(phase_deg=10.0)
-    with pytest.raises(ValueError, match="no secondary_path_uncertainty can be assigned to KF-PB"):
-        controller.secondary_path_uncertainty = 0.1
 
 
 # ---- What it tells
@@ -166,27 +149,6 @@ def test_the_price_is_recorded() -> None:
 
 
 # ---- Runs
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda c: c.update(np.nan), "error must be finite"),
-        (lambda c: c.update(1e200), "the error is too loud"),
-        (lambda c: c.control_signal(np.inf), "reference must be finite"),
-        (lambda c: c.control_signal(1e200), "the reference is too loud"),
-        (lambda c: c.listen(np.ones(3), np.ones(2)), "errors"),
-        (lambda c: setattr(c, "rated_power", -1.0), "rated_power must be greater than 0"),
-        (lambda c: setattr(c, "secondary_path", np.ones(M + 1)), "at most the 8 taps"),
-    ],
-)
-def test_what_is_refused_changes_nothing(call: Callable[[Any], Any], message: str) -> None:
-    refusing, twin = made(), made()
-    for one in (refusing, twin):
-        run(one, noise(0.5))
-    with pytest.raises(ValueError, match=message):
-        call(refusing)
-    assert_same_run(run(refusing, noise(0.5, 1)), run(twin, noise(0.5, 1)))
 
 
 def test_the_power_is_kept_over_any_averaging_time_and_used() -> None:

@@ -21,14 +21,13 @@ from kfopc_filterpy import (
     KFOPC,
     FxLMS,
     KalmanController,
-    LimitedController,
     OutputLimiter,
     OutputPowerConstraint,
     kf_anc,
     kf_opc,
     kf_pb,
 )
-from kfopc_filterpy.controllers import FeedbackNeutralizer, RefusedUpdate, VerifiedController, VirtualMicrophones
+from kfopc_filterpy.controllers import FeedbackNeutralizer, RefusedUpdate, VerifiedController
 
 FS = 4000.0
 DELAY = 40  # samples of the longest block
@@ -100,30 +99,6 @@ def test_a_subclass_with_its_own_step_is_called_for_each_sample() -> None:
     np.testing.assert_array_equal(got[:1], 0.5 * whole[:1])
     assert not np.array_equal(got, whole)
     assert np.any(got != 0.0)
-
-
-def test_a_filter_of_filterpy_and_wrappers_process_blocks() -> None:
-
-    class Own:
-        def control_signal(self, reference: float) -> float:
-            return 2.0 * reference
-
-        def update(self, error: float) -> None:
-            self.error = error
-
-    blocks, steps = (KalmanController(KalmanFilter(4, 1), [0.0, 1.0]) for _ in range(2))
-    y = blocks.process(X[:50], X[50:100])
-    for n in range(50):
-        assert y[n] == steps.control_signal(X[n])
-        steps.update(X[50 + n])
-    limited = LimitedController(Own(), OutputLimiter(1e3, amplitude_limit=1.0))
-    assert np.max(np.abs(limited.process(np.ones(8), np.zeros(8)))) == 1.0
-    paths = np.zeros((2, 1, 5))
-    paths[:, 0, 1] = 1.0
-    virtual = VirtualMicrophones(
-        FxLMS(4, paths[:1], step_size=0.1), paths, np.ones((1, 1, 1)), virtual=[0], physical=[1]
-    )
-    assert virtual.process(np.ones((1, 6)), np.ones((2, 6))).shape == (1, 6)
 
 
 @pytest.mark.parametrize("name", ["KF-OPC", "FxLMS of several channels"])

@@ -34,13 +34,6 @@ def made(
 # ---- Each repair
 
 
-def test_the_trimmed_factor_stops_at_1() -> None:
-    """At a rated power that is nearly enough, the trim asks for more than all at times."""
-    trimmed, untrimmed = (run(made(gain_of="reference", trim_s=t, rated_power=2.0)) for t in (TRIM_S, None))
-    assert np.max(trimmed.constraint_factor) == 1.0
-    assert np.sum((trimmed.constraint_factor == 1.0) & (untrimmed.constraint_factor < 0.98)) > 20
-
-
 def test_without_a_repair_it_is_kf_opc_bit_for_bit() -> None:
     """The same equations in the same order; a trim of 0 multiplies by exp(0) = 1."""
     settings = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
@@ -111,9 +104,6 @@ def test_the_trim_keeps_the_rated_power_where_eq_13_misses_it() -> None:
         assert power_with(**repairs) == pytest.approx(1.0, rel=0.02)
 
 
-# ---- Compiled, and step by step
-
-
 # ---- Refusals
 
 ESTIMATOR: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 0.1}
@@ -136,9 +126,3 @@ ESTIMATOR: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 0.1}
 def test_settings_out_of_range(options: dict, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
         kf_opc_repaired(**{"n_taps": 4, "secondary_path": S_HAT, "rated_power": 1.0} | ESTIMATOR | options)
-
-
-def test_another_sample_rate_is_refused() -> None:
-    options = {"disturbance": np.ones(10), "secondary_path": S_HAT}
-    with pytest.raises(ValueError, match="fs is 16000 Hz but the controller's power memory is for 8000 Hz"):
-        simulate(made(), np.ones(10), **options)

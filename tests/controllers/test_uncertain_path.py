@@ -20,8 +20,8 @@ from kfopc_filterpy import (
     simulate,
     simulate_scenarios,
 )
-from kfopc_filterpy.controllers import FeedbackNeutralizer, VerifiedController
-from kfopc_filterpy.paths import PathTolerance, guard_filter
+from kfopc_filterpy.controllers import FeedbackNeutralizer
+from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.signals import tone
 
 FS = 8000.0
@@ -29,42 +29,6 @@ TRUE = np.array([0.0, 0.0, 0.0, 1.0, -0.6])
 PRIMARY = np.array([0.0] * 8 + [0.8, 0.4])
 TOLERANCE = PathTolerance(delay_samples=1.0)
 DIRECT: dict[str, Any] = {"state_noise": 1e-9, "measurement_noise": 1e-3}
-
-
-# ---- The filters that adapt the control filter itself
-
-
-def rows(signal: np.ndarray, taps: int) -> np.ndarray:
-    """The delayed signals, (n_samples, taps), with zeros before the first sample."""
-    padded = np.concatenate([np.zeros(taps - 1), signal])
-    return np.lib.stride_tricks.sliding_window_view(padded, taps)[:, ::-1]
-
-
-SEVERAL = np.random.default_rng(6).standard_normal((3, 2, 5))  # three microphones, two loudspeakers
-CHANNEL_TAPS = 6
-
-
-def channel_rows(x: np.ndarray, signal_of: Any) -> np.ndarray:
-    """The rows of all microphones, (n_samples, K, J L): `signal_of` x' with their delays."""
-    filtered = [[rows(signal_of(np.convolve(x, s)[: x.size]), CHANNEL_TAPS) for s in each] for each in SEVERAL]
-    return np.moveaxis(np.array(filtered), (0, 1, 2, 3), (1, 2, 0, 3)).reshape(x.size, len(SEVERAL), -1)
-
-
-def both_rows(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    guard = guard_filter(TOLERANCE, SEVERAL)
-    return channel_rows(x, lambda s: s), channel_rows(x, lambda s: np.convolve(s, guard)[: s.size])
-
-
-def test_a_guarded_kalman_filter_of_several_channels_is_the_batch_solution() -> None:
-    n_samples, q, P0 = 300, 0.01, 2.0
-    x = np.random.default_rng(7).standard_normal((1, n_samples))
-    d = np.random.default_rng(8).standard_normal((len(SEVERAL), n_samples))
-    controller = kf_anc(CHANNEL_TAPS, SEVERAL, state_noise=0.0, measurement_noise=q, initial_variance=P0)
-    controller.secondary_path_uncertainty = TOLERANCE
-    simulate(controller, x, disturbance=d, secondary_path=SEVERAL, fs=FS)
-    F, G = (each.reshape(-1, each.shape[2]) for each in both_rows(x[0]))
-    expected = np.linalg.solve((F.T @ F + G.T @ G) / q + np.eye(F.shape[1]) / P0, F.T @ d.T.ravel() / q)
-    np.testing.assert_allclose(controller.weights.ravel(), expected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC", "leaky FxLMS"])
@@ -108,11 +72,3 @@ def test_what_takes_no_uncertainty_says_what_does() -> None:
     guarded.secondary_path_uncertainty = 0.1
     with pytest.raises(ValueError, match="must agree in their secondary-path uncertainty to share gains"):
         simulate_scenarios([guarded, plain], np.ones(50), disturbance=np.ones(50), secondary_path=TRUE, fs=FS)
-
-
-def test_an_uncertainty_assigned_to_a_wrapper_reaches_the_controller() -> None:
-    verified = VerifiedController(kf_anc(4, TRUE, state_noise=0.0, measurement_noise=0.1), fs=FS)
-    assert verified.secondary_path_uncertainty is None
-    verified.secondary_path_uncertainty = 0.1
-    assert verified.secondary_path_uncertainty == 0.1
-    assert verified.controller.secondary_path_uncertainty == 0.1
