@@ -10,7 +10,7 @@ import pytest
 
 from kfopc_filterpy import HardClipAmplifier, noise_reduction_db, nse_db, output_power
 from kfopc_filterpy.bench import registry as algorithms
-from kfopc_filterpy.bench.registry import PRICE_GRID, REGISTRY, STATE_NOISE_GRID, make_controller
+from kfopc_filterpy.bench.registry import REGISTRY, make_controller
 from kfopc_filterpy.bench.scene import Runs, Scene, make_scene
 from kfopc_filterpy.bench.tuning import AllDivergedError, Trial, best_setting, run_setting, try_settings, tune
 from kfopc_filterpy.controllers.core_controller import CoreController
@@ -164,13 +164,6 @@ def test_edges_of_one_and_of_two_settings(scene: Scene) -> None:
     two = [Trial((a, b), -9.0 * (a == b == 2.0), 0.1) for a in (1.0, 2.0, 3.0) for b in (1.0, 2.0, 3.0)]
     assert not at_edge(two)
     assert at_edge([replace(t, mean_nse_db=-10.0) if t.setting == (2.0, 3.0) else t for t in two])
-
-
-def test_the_state_noises_of_the_full_kalman_filters_are_one_grid() -> None:
-    full = [own for name, own in REGISTRY.items() if own.symbol == "r" and not name.startswith("diagonal")]
-    assert len(full) == 3
-    assert all(own.first == STATE_NOISE_GRID for own in full)
-    assert len(REGISTRY["leaky FxLMS"].grid) == 14 * len(PRICE_GRID)
 
 
 def test_trials_are_means_over_seeds_and_one_divergence_is_all(scene: Scene) -> None:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from kfopc_filterpy.bench import compare_recordings
-from kfopc_filterpy.bench.comparing import _edge
 from kfopc_filterpy.power import AmplifierRating
 from kfopc_filterpy.signals import tone
 
@@ -27,13 +26,6 @@ def test_powers_are_in_watts_if_the_rating_is(compared):
     assert power.get_legend_handles_labels()[1] == ["FxLMS", "Rated power 10 W"]
 
 
-def test_figures_say_when_the_control_is_switched_on(compared):
-    for item in compared.figures:
-        over_time = item.stem != "spectra"
-        assert ("The control is switched on 0.1 s into the recording." in item.caption) == over_time
-        assert (item.figure.axes[0].get_xlabel() == "Time since switch-on (s)") == over_time
-
-
 def test_the_summary_says_whether_the_amplifier_clips(compared):
     assert compared.summary.endswith(f"The amplifier clips beyond ±{np.sqrt(2 * 10 * 8) / 4:.3g}.")
 
@@ -46,9 +38,3 @@ def test_the_summary_says_whether_the_amplifier_clips(compared):
     assert " The amplifiers do not clip." in summary(*several, 1.0)
     clips = AmplifierRating(8.0, sine_watt=9.0, volts_per_unit=8.0)  # beyond 12 V
     assert " The amplifiers clip beyond: never, ±1.5." in summary(*several, [1.0, clips])
-
-
-def test_a_setting_at_the_edge_comes_with_advice():
-    assert "nothing is to be done" in _edge("KF-OPC", 1e-8)
-    assert "a setting beyond it may do better" in _edge("KF-OPC", 1e-4)
-    assert "mu L E[x'^2] and leak over E[x'^2] = 0.000122, 0.00383," in _edge("leaky FxLMS", (1.22e-4, 3.83e-3))

@@ -179,23 +179,6 @@ def test_the_page_shows_the_run_of_its_sliders_and_plays_it(address, browser):
         assert length == pytest.approx(3.0, abs=1e-3)
 
 
-@pytest.mark.slow
-def test_a_fixed_rating_stays_while_the_noise_gets_louder(address, browser):
-    browser.get(address)
-    wait_until(lambda: browser.execute_script("return window.Bokeh?.documents.length > 0"), "the page was open")
-    rest(browser)
-    browser.execute_script(WATCH, NAMES)
-    value = "return Bokeh.documents[0].get_model_by_name(arguments[0])"
-    start = browser.execute_script(f"{value}.value", "absolute_rating")
-    move(browser, "rating_kind", ".bk-btn:nth-child(2)", None)
-    assert browser.execute_script(f"{value}.disabled", "relative_rating")
-    assert not browser.execute_script(f"{value}.disabled", "absolute_rating")
-    relative = browser.execute_script(f"{value}.value", "relative_rating")
-    move(browser, "level", ".noUi-handle", "RIGHT")
-    assert browser.execute_script(f"{value}.value", "absolute_rating") == start
-    assert browser.execute_script(f"{value}.value", "relative_rating") == pytest.approx(relative - 1.0, abs=0.11)
-
-
 class Now:
     """A pool that runs what it is given at once, and counts it."""
 

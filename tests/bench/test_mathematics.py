@@ -40,18 +40,9 @@ def test_prose(text, shown):
     assert str(prose(text)) == shown
 
 
-def test_markup_in_a_text_is_escaped_beside_a_formula():
-    assert prose("<script>A^2</script>").count("<script>") == 0
-    assert prose("<b>A^2").startswith("&lt;b&gt;<math")
-
-
 def test_settings_of_the_registry_have_symbols():
     for name, algorithm in algorithms().items():
         for setting in (algorithm.symbol, algorithm.kind):
             symbol, meaning = parameter(setting)
             assert symbol.startswith("<math"), name
             assert meaning != setting
-
-
-def test_an_unknown_parameter_is_named_in_words():
-    assert parameter("room_size_m") == ("", "room size m")

@@ -2,7 +2,6 @@
 
 import base64
 import csv
-import html
 import io
 import json
 import re
@@ -15,7 +14,6 @@ import soundfile
 from helpers.reports import FS, D, figure, study
 from matplotlib.figure import Figure
 
-from kfopc_filterpy.bench import page as page_module
 from kfopc_filterpy.bench import report
 from kfopc_filterpy.bench.descriptions import DESCRIPTIONS
 from kfopc_filterpy.bench.registry import REGISTRY
@@ -102,34 +100,6 @@ def test_page_uses_no_network(written):
     assert not {"link", "iframe", "object"} & set(_Links(source).tags)
     assert not re.search(r"https?:|@import|url\(|fetch\(|import\(|XMLHttpRequest|<script src", source)
     assert "default-src 'none'" in source  # and the browser holds it to that
-
-
-def test_page_opens_with_the_argument(written):
-    """What KF-OPC is, the figure, the claims in a sentence; their table, once; of each study the figures before all else."""
-    source = (written / "report.html").read_text(encoding="utf-8")
-    marks = ["KF-OPC is a Kalman filter", '<figure class="first"', 'class="claims"', 'id="claims"', 'id="tonal"']
-    places = [source.index(mark) for mark in marks]
-    assert places == sorted(places)
-    assert source.count('<th scope="col" class="value">Claim</th>') == 1
-    assert source.count("0.79971 of 0.8") == 2  # one row for each study, nowhere else
-    own = source[source.index('id="tonal"') : source.index('id="duct-measured"')]
-    order = [
-        own.index(mark) for mark in ('<div class="figures">', 'class="player', "<h3>Results", "<details><summary>Notes")
-    ]
-    assert order == sorted(order)
-    assert own.index("</table>") < own.index("<details>")
-    folded = re.sub(r"<details>.*</details>", "", own, flags=re.DOTALL)
-    for hidden in ("One &lt;note&gt;.", "estimate &lt;of&gt; eq. 7"):
-        assert hidden in own
-        assert hidden not in folded
-
-
-def test_figures_have_captions_and_words_for_those_who_do_not_see_them(written):
-    source = (written / "report.html").read_text(encoding="utf-8")
-    for alt, rest in re.findall(r'<img alt="([^"]*)"(.*?)</figure>', source, flags=re.DOTALL):
-        assert alt
-        assert re.search(r"<figcaption>.+</figcaption>", rest)
-    assert source.count("<img ") == source.count("<figcaption>") == source.count("</figure>") == 2
 
 
 def test_words_for_a_figure():
@@ -221,31 +191,6 @@ def test_sounds_after_a_divergence_are_silent(written):
     assert np.any(diverged)
 
 
-def test_players_switch_within_their_group(tmp_path):
-    labels = ("Control off", "FxLMS", "KF-OPC")
-    groups = [Sound(f"{group}-{i}", label, D, group) for group in ("jump", "sweep") for i, label in enumerate(labels)]
-    source = write_report([study(sounds=[*groups, Sound("alone", "Alone", D)])], tmp_path).read_text(encoding="utf-8")
-    assert re.findall(r'<div class="(player[ group]*)" id="([\w-]+)"', source) == [
-        ("player group", "tonal-sounds-0"),
-        ("player group", "tonal-sounds-1"),
-        ("player", "tonal-sounds-2"),  # nothing to switch to
-    ]
-    radios = re.findall(r'<input type="radio" name="([\w-]+)" value="(\d)"( checked)?>(.*?)</label>', source)
-    assert radios == [
-        (f"tonal-sounds-{number}", value, checked, label)
-        for number in (0, 1)
-        for value, checked, label in (("1", "", "FxLMS"), ("2", " checked", "KF-OPC"))
-    ]
-    assert source.count('<button type="button" class="control"') == 2  # buttons and radios take keys by themselves
-
-
-def test_without_figures_of_merit_the_first_figure_leads(tmp_path):
-    source = write_report([study(algorithms={})], tmp_path).read_text(encoding="utf-8")
-    assert source.count("<figure") == 1
-    assert '<figure class="first"' in source
-    assert not (tmp_path / "figures" / "at-a-glance.png").exists()
-
-
 def test_an_excerpt_from_before_the_sound_is_refused():
     with pytest.raises(ValueError, match="from_s must be a time in s from 0 on, got -1"):
         Sound("a", "", D, from_s=-1.0)
@@ -300,19 +245,6 @@ def test_a_table_on_the_page(tmp_path):
     assert "Powers < 1 & more" in _Links(source).text
 
 
-def test_a_table_for_the_terminal():
-    lines = results_table([study(algorithms={}, tables=[POWERS, EMPTY])]).splitlines()
-    begin = lines.index(POWERS.caption)
-    assert lines[begin - 1] == ""
-    assert lines[begin + 1 : begin + 5] == [  # text to the left, columns with a number in them to the right
-        "paths      noise, of <kind>   power",
-        'duct             tone "300"  0.1235',
-        "band-pass          diverged   1e+06",
-        "duct                      7       3",
-    ]
-    assert lines[-1].startswith("1 of the 2 claims of the paper was reproduced; the other is of")
-
-
 def test_the_terminal_shows_one_table_beside_the_claims():
     """The first that fits a screen, unless there are figures of merit; what claims nothing shows all that fit."""
     long = Table("long", "Too long", ["power"], [[1.0]] * 31)
@@ -339,15 +271,6 @@ def test_a_table_as_a_file_has_all_digits(tmp_path):
         ["duct", "7.0", "3"],
     ]
     assert (tmp_path / "tables" / "tonal-none.csv").read_bytes() == b"paths,power\n"
-
-
-def test_without_tables_there_is_no_folder_of_tables(written):
-    assert sorted(path.name for path in written.iterdir()) == ["audio", "figures", "report.html", "results.json"]
-
-
-def test_what_the_claims_are_is_their_heading(tmp_path):
-    source = write_report([study(claims_heading="Aims"), study("duct")], tmp_path).read_text(encoding="utf-8")
-    assert re.findall(r"</a>: (.*?)</th>", source) == ["aims, 1 of 2 met", "claims of the paper, 1 of 2 reproduced"]
 
 
 def test_figures_held_for_the_report_are_unknown_to_pyplot():
@@ -409,18 +332,6 @@ def test_output_powers_in_watts(tmp_path):
     assert "Output power (W)" in source
     assert "= 10 W, sampling frequency" in source
     assert json.loads((tmp_path / "results.json").read_text())["studies"]["tonal"]["rated_power"] == 0.8
-
-
-def test_the_introduction_is_on_the_algorithms_of_the_report(tmp_path):
-    merit = {"noise_reduction_db": 1.0, "output_power": 0.5}
-    with_it = write_report([study()], tmp_path / "with").read_text(encoding="utf-8")
-    assert page_module.PAPER in html.unescape(with_it)
-    assert "KF-ANC, a Kalman filter that learns the control filter" in with_it
-    compared = study(algorithms={"KF-PB": merit, "own": merit}, claims=[])
-    without = write_report([compared], tmp_path / "without").read_text(encoding="utf-8")
-    assert f"<h1>{page_module.WITHOUT_CLAIMS}</h1>" in without
-    assert page_module.PAPER not in html.unescape(without)
-    assert "KF-PB, a Kalman filter that learns the paths" in without
 
 
 def test_every_algorithm_has_a_description():

@@ -29,13 +29,7 @@ def small() -> Any:
     constants = {"ALGORITHMS": STUDIED, "OVERDRIVES_DB": (0.0, 10.0), "DURATION_S": 2.0}
     own = {"all_cases": lambda names: studied, "PEAK_LIMITED": ("clipping FxLMS",)}
     with smaller(cases, N_TAPS=TAPS, ducts=lambda: short), smaller(amplifier, **constants, **own):
-        return *run_study(amplifier), cases.driven_case(short["duct"], cases.noise_of("tone", 2.0), 0.0)
-
-
-def test_planned_runs_are_those_taken(small: Any) -> None:
-    _, done, planned, _ = small
-    # two cases, two overdrives: three filters of 5 settings twice, FxLMS of 14, clipping of 14 x 2; 5 + 3 at their best
-    assert planned == done == 2 * 2 * (2 * 11 + 14 + 28 + 8)
+        return run_study(amplifier), cases.driven_case(short["duct"], cases.noise_of("tone", 2.0), 0.0)
 
 
 def test_the_report_is_complete(small: Any) -> None:
@@ -50,22 +44,9 @@ def test_the_report_is_complete(small: Any) -> None:
     assert [len(tried[name]["tried"]) for name in STUDIED] == [5, 14, 5, 1, 28]
 
 
-def test_the_table_counts_the_rows(small: Any) -> None:
-    (table,) = small[0].tables
-    names = [
-        (known, name) for known in (UNKNOWN, KNOWN) for name in STUDIED if known == UNKNOWN or name.startswith("KF")
-    ]
-    assert [(row[1], row[0]) for row in table.rows] == names
-    rows = [row for row in small[0].extra["rows"] if (row["algorithm"], row["known"]) == ("KF-ANC", UNKNOWN)]
-    over = sum(row["asked_power"] > 2.0 for row in rows)
-    powers = sorted(row["power"] for row in rows)
-    assert table.rows[0][2:6] == [len(rows), over, 0, f"{powers[0]:.3g} to {powers[-1]:.3g}"]
-    assert over > 0
-
-
 @pytest.mark.parametrize(("algorithm", "known"), [("KF-PB", UNKNOWN), ("KF-ANC", KNOWN), ("clipping FxLMS", UNKNOWN)])
 def test_a_row_is_that_of_a_plain_run(small: Any, algorithm: str, known: str) -> None:
-    report, _, _, scene = small
+    report, scene = small
     (row,) = (
         r
         for r in report.extra["rows"]
@@ -94,7 +75,7 @@ def test_a_row_is_that_of_a_plain_run(small: Any, algorithm: str, known: str) ->
 
 
 def test_known_amplifiers_reach_those_that_can_know_them(small: Any) -> None:
-    scene = small[3]
+    scene = small[1]
     case = Case("duct", "tone", "soft saturation")
     driven = saturating(scene, case, 6.0, KNOWN)
     assert isinstance(driven.amplifier, SoftSaturationAmplifier)
@@ -105,7 +86,7 @@ def test_known_amplifiers_reach_those_that_can_know_them(small: Any) -> None:
 
 
 def test_peak_limits_go_up_to_the_amplifiers(small: Any) -> None:
-    driven = saturating(small[3], Case("duct", "tone", "hard clip"), 10.0, UNKNOWN)
+    driven = saturating(small[1], Case("duct", "tone", "hard clip"), 10.0, UNKNOWN)
     limits = {
         round(make_controller(driven, "clipping FxLMS", setting).amplitude_limit, 9)
         for setting in settings_for(driven, ("clipping FxLMS",))["clipping FxLMS"]
@@ -189,32 +170,16 @@ def test_claims_on_both_sides_of_each_threshold(which: int, changed: AmplifierRo
     assert claim(which, changed).holds == met
 
 
-def test_overruns_are_told_of_the_runs_that_went_on() -> None:
-    lost = [row("KF-ANC", diverged_at_s=at, asked_power=np.nan, weight_growth=np.nan) for at in (0.5, 0.0, 1.0)]
-    figure = claim(OVERRUNS, row("KF-ANC", asked_power=4.0, weight_growth=1.25), *lost).measured
-    assert figure.startswith("6 of 6 runs; their weights end up asking for 4 to 9 times the power")
-    assert "and grow 1 to 1.25 times over the second half; 3 passed 1e6 times the rated amplitude" in figure
-
-
 def test_nothing_is_claimed_of_harmonics_and_order_without_overdrive() -> None:
     clean = [row(name, 0.0, harmonics_db=-62.0) for name in ("KF-ANC", "KF-OPC", "KF-PB")]
     assert claim(CLEAN, *clean).holds
     assert claim(ORDER, *clean).holds
 
 
-@pytest.mark.parametrize(
-    ("anc_db", "pb_db", "said"),
-    [
-        (-20.0, -60.0, "by 40.0 dB at least (KF-PB, duct, tone, hard clip, 0.5 dB)"),
-        (np.nan, -20.0, "by 60.0 dB at least (KF-OPC, duct, tone, hard clip, 2.0 dB)"),
-        (-20.0, np.nan, "by nan dB at least (KF-PB, duct, tone, hard clip, 0.5 dB)"),
-        (np.nan, np.nan, "by nan dB at least"),
-    ],
-)
-def test_harmonics_of_a_run_that_diverged_meet_nothing(anc_db: float, pb_db: float, said: str) -> None:
+@pytest.mark.parametrize(("anc_db", "pb_db"), [(-20.0, -60.0), (np.nan, -20.0), (-20.0, np.nan), (np.nan, np.nan)])
+def test_harmonics_of_a_run_that_diverged_meet_nothing(anc_db: float, pb_db: float) -> None:
     found = claim(CLEAN, row("KF-ANC", 0.5, harmonics_db=anc_db), row("KF-PB", 0.5, harmonics_db=pb_db))
     assert found.holds == np.isfinite(pb_db)
-    assert found.measured.startswith(said)
 
 
 @pytest.mark.parametrize(("reduction", "met"), [(5.01, True), (5.0, False), (np.nan, False)])

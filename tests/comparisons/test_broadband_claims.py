@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.results import single_result
-from helpers.studies import smaller
 
 from comparisons.studies import broadband
 from comparisons.studies.broadband import FS, KNOWING, UNAWARE
 from comparisons.studies.report_parts import first_second_db
 from comparisons.studies.weight_errors import WEIGHTS_EVERY, first_below_s, settled_after_s, weight_error
 from kfopc_filterpy.bench import make_scene, with_clipping
-from kfopc_filterpy.signals import band_limited_noise
 
 
 @pytest.mark.parametrize(
@@ -139,16 +137,6 @@ def test_the_first_second_is_a_whole_second_and_no_more() -> None:
 # ---- Weight error
 
 
-def test_weight_error_of_white_noise_is_the_squared_distance() -> None:
-    """The autocorrelation of white noise is the identity, to some 1/sqrt(n): 3 standard errors are 1 %."""
-    x = np.random.default_rng(1).standard_normal(100_000)
-    own = np.array([1.0, 2.0, -1.0])
-    weights = np.vstack([np.zeros(3), own + np.array([0.0, 0.0, 0.3]), np.tile(own, (6, 1))])
-    curve = weight_error(weights, x)
-    assert curve[:2] == pytest.approx([1.0, 0.3**2 / 6.0], rel=0.02)
-    np.testing.assert_array_equal(curve[2:], 0.0)
-
-
 def test_weight_error_is_the_missing_part_of_the_anti_noise() -> None:
     """Against the anti-noise itself, sample by sample, with coloured noise."""
     rng = np.random.default_rng(2)
@@ -190,26 +178,3 @@ def test_q_with_clipping_is_that_of_a_clipped_gaussian() -> None:
     assert limited.measurement_noise - scene.measurement_noise == pytest.approx(unexplained, rel=0.02)
     assert limited.amplifier(9.0) == pytest.approx(sqrt(1.6))
     assert scene.amplifier is None
-
-
-def test_every_run_with_clipping_is_made_as_it_says() -> None:
-    """All seeds; the q of the clipping for all algorithms but the two that show what another q does."""
-    noises = {k: band_limited_noise((200.0, 2000.0), 0.7, fs=FS, rng=k) for k in (1, 2)}
-    scene = make_scene(noises, [0.0, 0.0, 1.0], [1.0], fs=FS, rated_power=0.8, power_multiple=4.0, n_taps=8)
-    limited = with_clipping(scene)
-    seen = []
-
-    def run_all(runs: Any, own: Any, tuned: Any) -> Any:
-        seen.append((own.measurement_noise, own.amplifier, own.known_amplifier, tuple(tuned)))
-        return {name: [name] * 2 for name in tuned}
-
-    tuned: Any = dict.fromkeys(("KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS"))
-    with smaller(broadband, _run_all=run_all):
-        results = broadband._run_clipped(None, scene, limited, tuned)
-    low, high, amplifier = scene.measurement_noise, limited.measurement_noise, limited.amplifier
-    assert seen == [
-        (high, amplifier, None, tuple(tuned)),
-        (low, amplifier, None, ("KF-OPC",)),
-        (low, amplifier, amplifier, ("KF-OPC",)),
-    ]
-    assert list(results) == [*tuned, UNAWARE, KNOWING]

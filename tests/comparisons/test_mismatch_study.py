@@ -28,13 +28,7 @@ def small() -> Any:
     short = short_duct()
     constants = {"ALGORITHMS": STUDIED, "AMOUNTS": AMOUNTS, "DURATION_S": 1.0}
     with smaller(cases, N_TAPS=TAPS), smaller(mismatch, ducts=lambda: short, **constants):
-        return *run_study(mismatch), case_scene(Case("duct", "tone"), short["duct"])
-
-
-def test_planned_runs_are_those_taken(small: Any) -> None:
-    _, done, planned, _ = small
-    # band noise and a tone, five different paths, three filters of 5 settings and two of 14
-    assert planned == done == 2 * 5 * (2 * 5 + 1 + 2 * 14)
+        return run_study(mismatch), case_scene(Case("duct", "tone"), short["duct"])
 
 
 def test_the_report_is_complete(small: Any) -> None:
@@ -53,27 +47,13 @@ def test_the_report_is_complete(small: Any) -> None:
     assert [len(tried[name]["tried"]) for name in STUDIED] == [5, 5, 1, 14, 14]
 
 
-@pytest.mark.parametrize(("stem", "tuned_with"), [("exact", EXACT), ("wrong", WRONG), ("power", EXACT)])
-def test_tables_hold_the_rows(small: Any, stem: str, tuned_with: str) -> None:
-    report: StudyReport = small[0]
-    table = next(table for table in report.tables if table.stem == stem)
-    assert list(table.headings) == ["paths", "noise", "mismatch", *STUDIED]
-    assert len(table.rows) == 2 * 7
-    line = next(row for row in table.rows if tuple(row[:3]) == ("duct", "tone", "phase +45 degrees"))
-    figure = "power" if stem == "power" else "noise_reduction_db"
-    rows = {r["algorithm"]: r for r in report.extra["rows"] if _is(r, "tone", "phase", 45.0, tuned_with)}
-    assert list(line[3:]) == [
-        rows[name][figure] if rows[name]["diverged_at_s"] is None else "diverged" for name in STUDIED
-    ]
-
-
 def _is(row: dict[str, Any], noise: str, kind: str, amount: float, tuned_with: str) -> bool:
     return (row["noise"], row["kind"], row["amount"], row["tuned_with"]) == (noise, kind, amount, tuned_with)
 
 
 @pytest.mark.parametrize("algorithm", ["KF-OPC", "FxLMS"])
 def test_rows_are_those_of_plain_runs(small: Any, algorithm: str) -> None:
-    report, _, _, scene = small
+    report, scene = small
     (row,) = (r for r in report.extra["rows"] if r["algorithm"] == algorithm and _is(r, "tone", "phase", 45.0, EXACT))
     estimate = path_taps(perturbed_path(scene.secondary, fs=16000.0, phase_deg=45.0))
     wrong = replace(scene, secondary_estimate=estimate)
@@ -103,7 +83,7 @@ def test_tuning_with_the_exact_path_is_the_same_at_no_mismatch(small: Any) -> No
 
 def test_the_settings_scale_with_the_known_path(small: Any) -> None:
     # An estimate half as loud: the filtered reference has a quarter of the power, the step size is four times as large.
-    scene = small[3]
+    scene = small[1]
     exact = make_controller(scene, "FxLMS", 2.0**-7)
     softer = make_controller(replace(scene, secondary_estimate=0.5 * scene.secondary), "FxLMS", 2.0**-7)
     assert softer.step_size == pytest.approx(4 * exact.step_size)
@@ -205,22 +185,6 @@ def test_claims_on_both_sides_of_each_threshold(which: int, changed: MismatchRow
 def test_kf_opc_is_claimed_to_miss_its_power_under_a_wrong_gain(power: float, met: bool) -> None:
     rows = [replace(one, power=power) if one.algorithm == "KF-OPC" else one for one in GOOD]
     assert mismatch.claims(rows)[POWER].holds == met
-
-
-def test_claims_tell_the_worst_and_the_best() -> None:
-    rows = [row(amount=89.0, noise_reduction_db=0.5), row(amount=100.0, noise_reduction_db=-2.0)]
-    told = claim(FXLMS_BELOW_90, *rows).measured
-    assert told.startswith("3 of 3 runs below reduce it, the least by 0.5 dB")
-    assert "phase +89 degrees" in told
-    assert "0 of 2 above, the best of which is -2.0 dB" in told
-    for changes, lost in (({"noise_reduction_db": 4.9}, "1.1 dB"), (LOST, "diverges")):
-        found = claim(GAIN, gain_row("KF-PB", **changes))
-        assert found.measured == f"largest loss: KF-ANC 0.0 dB, KF-PB {lost}, FxLMS 0.0 dB, MOV-FxLMS 0.0 dB"
-        assert found.text.startswith("A gain up to 12 dB off")
-    rows = [row(algorithm="KF-PB", noise_reduction_db=-3.5), row(tuned_with=EXACT, diverged_at_s=2.0)]
-    told = claim(BOUNDED, *rows).measured
-    assert "the loudest left 3.5 dB more than the noise (KF-PB, duct" in told
-    assert told.endswith("Of the unconstrained algorithms tuned with the exact path 1 of 5 diverged")
 
 
 def test_unstable_is_diverged_or_louder() -> None:

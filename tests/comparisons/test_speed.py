@@ -72,14 +72,6 @@ def test_the_command_writes_what_it_measured(small, tmp_path, capsys):
     assert many["filterpy_us"] > 5 * many["ours_us"], many  # O(L^3) against O(L^2) at 256 taps
 
 
-def test_what_is_stepped_from_python_is_what_the_loop_runs():
-    for name in speed_variants.CONTROLLERS:
-        for make in (speed_variants.closed_loop, speed_variants.stepped):
-            run, samples = make(name, 8)
-            run()
-            assert samples > 0
-
-
 def test_rows_follow_from_the_measured_times():
     best = {"mine": 2.0, "filterpy": 100.0, "numpy rank-1": 8.0}
     mine, theirs, _ = speed.rows_of(100, 30.0, best)
@@ -99,12 +91,6 @@ def test_real_time_taps_are_the_most_that_are_done_before_the_next_sample():
 def test_a_filter_that_is_not_installed_is_left_out():
     with smaller(speed, find_spec=lambda name: None):
         assert set(speed.chosen_variants(64)) == {*speed_variants.OURS, "numpy rank-1", "filterpy"}
-
-
-def test_speed_runs_alone(capsys):
-    with pytest.raises(SystemExit):
-        main(["speed", "tonal"])
-    assert "speed runs alone" in capsys.readouterr().err
 
 
 def test_speed_without_its_extra_says_what_to_install(tmp_path, capsys):

@@ -9,7 +9,6 @@ from contextlib import chdir
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
 from scipy import stats
 
 from comparisons.__main__ import main
@@ -20,7 +19,6 @@ from comparisons.sweep.results import cell_rows, mean_and_interval, sweep_figure
 from comparisons.sweep.run import run_sweep
 from comparisons.sweep.scenario import ScenarioError
 from comparisons.sweep.store import keep, kept
-from kfopc_filterpy.bench import algorithms
 
 CALLS: list[tuple] = []
 
@@ -74,18 +72,6 @@ def test_axes_not_named_have_their_default():
     assert grid.axes["algorithm"] == ("KF-PB",)  # the name as the studies write it
     assert grid.axes["n_taps"] == (128,)
     assert grid.seeds == (1, 2)
-
-
-def test_names_may_have_hyphens_for_spaces():
-    grid = built_in_grid({"noise": "band-noise", "amplifier": ["Hard-Clip", "soft"], "path": "Band pass"}, 1)
-    assert grid.axes["noise"] == ("band noise",)
-    assert grid.axes["amplifier"] == ("hard clip", "soft")
-    assert grid.axes["path"] == ("band-pass",)
-
-
-@pytest.mark.parametrize("name", algorithms())
-def test_every_listed_algorithm_is_known(name):
-    assert built_in_grid({"algorithm": name, "setting": "tuned"}, 1).axes["algorithm"] == (name,)
 
 
 def test_an_algorithm_of_two_settings_has_to_be_tuned():
@@ -158,13 +144,6 @@ def test_interval_is_that_of_scipy():
     np.testing.assert_allclose((low, high), expected, rtol=1e-12)  # the same formula, other order of operations
 
 
-def test_interval_by_hand():
-    # Mean 3, standard deviation sqrt(2), t(0.975, 1) = tan(0.475 pi) for one degree of freedom.
-    mean, low, high, count = mean_and_interval([2.0, 4.0, math.nan, math.inf])
-    assert (mean, count) == (3.0, 2)
-    assert high - mean == mean - low == pytest.approx(math.tan(0.475 * math.pi), rel=1e-12)
-
-
 def test_no_interval_for_one_seed_and_nothing_for_none():
     assert mean_and_interval([5.0])[0] == 5.0
     assert np.isnan(mean_and_interval([5.0])[1:3]).all()
@@ -221,12 +200,6 @@ def test_column_of_names_and_numbers_becomes_strings(tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow, the extra parquet, is not installed")
     write_table([{"setting": "default"}, {"setting": 0.5}], tmp_path / "mixed", "parquet")
     assert parquet.read_table(tmp_path / "mixed.parquet").to_pylist() == [{"setting": "default"}, {"setting": "0.5"}]
-
-
-def test_format_that_is_none_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="format must be one of csv, parquet, got 'xlsx'"):
-        swept(tmp_path / "new", format="xlsx")
-    assert not (tmp_path / "new").exists()
 
 
 # The folder.
@@ -381,29 +354,6 @@ def test_figure_shows_the_means_and_intervals():
     assert ax.get_legend_handles_labels()[1] == ["a", "b"]
 
 
-def test_figure_keeps_a_place_for_what_diverged_and_room_for_what_did_not():
-    grid = built_in_grid({"setting": [1e-3, 1.0], "algorithm": ["KF-OPC", "FxLMS"]}, 2)
-    figures = [
-        {"noise_reduction_db": 10.0, "output_power_db": 0.0, "diverged": run["setting"] == 1.0} for run in grid.runs()
-    ]
-    figures[0] |= {"noise_reduction_db": -300.0, "output_power_db": 300.0}
-    figure = sweep_figure(grid, cell_rows(grid, figures), ["noise_reduction_db", "output_power_db"])
-    reduction, power = figure.axes
-    assert reduction.get_xscale() == "log"
-    assert reduction.get_xlim()[0] < 1e-3 < 1.0 < reduction.get_xlim()[1]
-    assert reduction.get_ylim()[0] == -20.0
-    assert power.get_ylim()[1] == 40.0
-    crosses = [line for line in reduction.lines if line.get_marker() == "x"]
-    assert [list(line.get_xdata()) for line in crosses] == [[1.0], [1.0]]  # of either algorithm
-    figure.canvas.draw()  # no warning
-
-
-def test_figure_is_written(tmp_path):
-    (image,) = (path for path in swept(tmp_path).files if path.suffix == ".png")
-    assert image.name == "slope.png"
-    assert imread(image)[..., :3].std() > 0.05  # something is on it
-
-
 # The command line.
 
 
@@ -475,9 +425,3 @@ def test_command_refuses(inside, capsys, arguments, message):
     assert refused.value.code == 2
     assert message in capsys.readouterr().err
     assert not list(inside.iterdir())  # nothing was begun
-
-
-def test_sweep_is_named_first(capsys):
-    with pytest.raises(SystemExit):
-        main(["tonal", "sweep"])
-    assert "sweep runs alone, and is named first" in capsys.readouterr().err

@@ -98,12 +98,6 @@ def test_growth(anc: Growth, opc: Growth, held: bool) -> None:
     assert growth_claim({1e-8: (anc, opc), 1e-4: (LINE, STILL)}).holds is held
 
 
-def test_a_divergence_is_said() -> None:
-    assert "the numbers do not overflow" in growth_claim({1e-8: (LINE, STILL)}).measured
-    diverged = Growth(600.0, 2.0, 1.0, diverged_at_s=3.14)
-    assert growth_claim({1e-8: (diverged, STILL)}).measured.endswith("diverged after 3.1 s")
-
-
 def of_weights(largest: Any) -> Any:
     """A run of three weights, of which the second one is the largest."""
     return single_result(weights=np.outer(largest, [0.5, -1.0, 0.0]))

@@ -38,13 +38,7 @@ def small() -> Any:
     with smaller(cases, N_TAPS=TAPS), smaller(events, **times), smaller(tracking, **own):
         chosen = [event for event in events.all_events() if event.name in names]
         with smaller(events, all_events=lambda: chosen):
-            return *run_study(tracking), events.scenes_of(chosen[1], short["duct"])
-
-
-def test_planned_runs_are_those_taken(small: Any) -> None:
-    _, done, planned, _ = small
-    # three events, two filters of 5 settings, one of 1 and two of 14, and each at its best
-    assert planned == done == 3 * (2 * 5 + 1 + 2 * 14 + 5)
+            return run_study(tracking), events.scenes_of(chosen[1], short["duct"])
 
 
 def test_the_report_is_complete(small: Any) -> None:
@@ -67,7 +61,7 @@ def test_the_report_is_complete(small: Any) -> None:
 
 @pytest.mark.parametrize("algorithm", ["KF-PB", "FxLMS"])
 def test_a_row_is_that_of_plain_runs(small: Any, algorithm: str) -> None:
-    report, _, _, scenes = small
+    report, scenes = small
     (row,) = (r for r in report.extra["rows"] if (r["event"], r["algorithm"]) == ("sign", algorithm))
     results = [
         simulate(
@@ -209,8 +203,3 @@ GOOD = [
 )
 def test_claims_on_both_sides_of_each_threshold(which: int, rows: list[TrackingRow], met: bool) -> None:
     assert tracking.claims([*GOOD, *rows])[which].holds == met
-
-
-def test_the_mean_nse_is_told_on_average_and_at_least() -> None:
-    told = tracking.claims([*GOOD, *compared("delay", mean_nse_db=-5.5)])[MEAN_NSE].measured
-    assert told == "by 2.2 dB on average, by 0.50 dB at least (delay, duct)"

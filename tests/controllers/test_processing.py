@@ -173,10 +173,10 @@ def test_memory_is_not_allocated_after_the_first_block(name: str) -> None:
 
 
 def test_the_interpreter_lock_is_released() -> None:
-    """While a thread processes a block of more than a second, this one counts."""
+    """While a thread processes a block of half a second or so, this one counts."""
     controller = kf_anc(256, PATH, state_noise=1e-9, measurement_noise=1.0)
     controller.process(X[:10], X[:10])
-    x = np.random.default_rng(0).standard_normal(100_000)
+    x = np.random.default_rng(0).standard_normal(40_000)
     thread = threading.Thread(target=controller.process, args=(x, x))
     thread.start()
     ticks = 0

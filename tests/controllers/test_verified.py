@@ -166,11 +166,10 @@ def test_of_several_loudspeakers_one_may_change() -> None:
     assert controller.primary_path.shape == (2, 2, L + M - 1)
 
 
-@pytest.mark.parametrize("name", ["FxLMS", "KF-ANC"])
-def test_what_it_cannot_follow_is_silenced_for_longer_and_longer(name: str) -> None:
+def test_what_it_cannot_follow_is_silenced_for_longer_and_longer() -> None:
     """The true path is longer than the estimate."""
     x, d = noises(12.0)
-    controller = verified(MAKERS[name]())
+    controller = verified(MAKERS["KF-ANC"]())
     error, y = run(controller, x, d, np.concatenate((np.zeros(14), -S)))
     assert changes_db(error, d, 0.5).max() < 2.2
     assert np.mean(error[-8000:] ** 2) < 10**0.05 * np.mean(d[-8000:] ** 2)

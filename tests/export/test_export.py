@@ -41,7 +41,6 @@ from kfopc_filterpy import (
 from kfopc_filterpy.controllers import CoreController, VerifiedController, load_algorithm
 from kfopc_filterpy.core.building import FOLDER, core_sources
 from kfopc_filterpy.export import Float32Controller, export_c
-from kfopc_filterpy.export.joined import sources_of
 
 L, RATED, WINDOW = 16, 0.5, 800
 TRAINING, SAMPLES = 3_000, 5_000
@@ -248,13 +247,6 @@ def test_float32_is_close_to_float64(name):
     assert trained.limiter is not None or difference.max() <= 1e-2
 
 
-@pytest.mark.parametrize("options", [(), ("-O1", "-DLANES_OF_ONE=1"), ("-O1", "-march=native")], ids=" ".join)
-def test_the_bits_do_not_depend_on_the_processor(options, tmp_path):
-    trained, result = trained_and_run("KF-OPC, everything")
-    out = Program(trained, tmp_path, options=options).run(result.reference, result.error)
-    np.testing.assert_array_equal(out.y, result.control_signal)
-
-
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_in_a_long_run_no_window_of_the_limiters_output_exceeds_the_rated_power(dtype, tmp_path):
     controller, n = CONTROLLERS["KF-OPC, limited"](), 200_000
@@ -291,19 +283,6 @@ def test_an_export_between_the_two_calls_of_a_sample_continues_with_the_update(n
     out = Program(controller, tmp_path, first=1).run(x[:, 50:], e[:, 50:])
     controller.update(sample(controller, e[:, 50]))
     np.testing.assert_array_equal(out.y[:, 1:], stepped(controller, x[:, 51:], e[:, 51:]))
-
-
-def test_what_was_assigned_before_the_export_is_exported(tmp_path):
-    controller = CONTROLLERS["KF-OPC"]()
-    x, e = (signal[:1, :300] for signal in noises())
-    stepped(controller, x, e)
-    controller.measurement_noise, controller.state_noise, controller.secondary_path = (
-        0.3,
-        1e-6,
-        [0.0, 0.7, 0.1, 0.0, 0.2],
-    )
-    out = Program(controller, tmp_path).run(x, e)
-    np.testing.assert_array_equal(out.y, stepped(controller, x, e))
 
 
 @pytest.mark.parametrize("name", ["FxLMS, limited", "KF-OPC, everything"])
@@ -389,15 +368,6 @@ def test_a_covariance_that_is_too_large_for_a_reference_is_refused(dtype, varian
     np.testing.assert_array_equal(np.flatnonzero(out.status), [100, 101])
     assert set(out.status) == {0, 5}
     assert np.isfinite(out.y).all()
-
-
-def test_without_measurement_noise_silence_teaches_nothing(tmp_path):
-    controller = kf_anc(4, [1.0, 0.5], state_noise=1e-6, measurement_noise=0.0)
-    x, e = (signal[:1, :300].copy() for signal in noises())
-    x[:, 100:120] = 0.0
-    out = Program(controller, tmp_path).run(x, e)
-    np.testing.assert_array_equal(out.y, stepped(controller, x, e))
-    assert not out.status.any()
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -596,11 +566,6 @@ def test_the_files_of_the_core_that_are_needed_stand_in_the_source_as_they_are(n
     assert not [file for file in others if f"/* ---- {file}.c ---- */" in text]
 
 
-def test_a_file_needs_what_it_names_but_not_what_it_defines_itself():
-    assert sources_of("int anc_size_of(int);") == []
-    assert [path.name for path in sources_of("anc_amplify(&amplifier, y)")] == ["amplifier.c"]
-
-
 def test_only_the_calls_are_visible_and_only_the_mathematics_library_is_needed(tmp_path):
     if shutil.which("nm") is None:
         pytest.skip("needs nm, which lists a file's symbols")
@@ -636,15 +601,6 @@ def test_fast_math_is_refused_by_the_file_itself(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode != 0
     assert "compile it without -ffast-math" in done.stderr
-
-
-def test_the_header_and_the_repr_state_the_size(tmp_path):
-    exported = export_c(made("KF-OPC"), tmp_path / "anc.c", dtype="float32")
-    header = exported.header_path.read_text()
-    assert f"{exported.n_bytes:,} bytes" in header
-    assert f"state of {exported.n_bytes:,} bytes>" in repr(exported)
-    assert f"KF-OPC: {L} taps, rated power 0.5" in header
-    assert "#define ANC_ADAPTED 0\n#define ANC_LOUD_REFERENCE 1\n" in header
 
 
 def test_a_name_cannot_end_the_comment_that_it_stands_in(tmp_path):

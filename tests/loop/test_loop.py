@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.comparing import SIGNALS, assert_goes_on_as, assert_same_run
+from helpers.comparing import SIGNALS, assert_same_run
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R, S, noises, run, sensor_noise
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -100,39 +100,6 @@ def test_any_filterpy_filter_runs_in_the_loop(own, rated_power):
 
 
 # ---- One definition of the equations, two ways to run them
-
-
-@pytest.mark.parametrize("n_taps", [1, 2, 3, 4, 7, 16, 129])  # the vectors have 2, 4 or 8 numbers, and a rest
-@pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
-def test_compiled_run_is_the_steps_bit_for_bit(name, n_taps):
-    fast, slow = controller(name, n_taps=n_taps), controller(name, n_taps=n_taps)
-    options = {"amplifier": AMPLIFIERS["soft"][0], "feedback": FEEDBACK, "on": 17, "n": 300}
-    assert_same_run(run(fast, **options), run(slow, compiled=False, **options))
-    np.testing.assert_array_equal(fast.weights, slow.weights)
-    assert_goes_on_as(fast, slow)
-    assert_same_run(run(fast, n=50), run(slow, n=50, compiled=False))  # and they go on alike
-    assert_same_run(run(fast, n=50, compiled=False), run(slow, n=50))
-
-
-def noisier(made):
-    made.state_noise, made.measurement_noise = 1e-4, 0.5
-
-
-def held_factor(made):
-    made.constraint.factor = 0.5
-
-
-@pytest.mark.parametrize("change", [noisier, held_factor])
-@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
-def test_compiled_run_takes_up_what_was_set(name, change):
-    fast, slow = controller(name), controller(name)
-    for made in (fast, slow):
-        run(made, n=40, compiled=False)
-        change(made)
-    assert_same_run(run(fast), run(slow, compiled=False))
-    np.testing.assert_array_equal(fast.covariance, slow.covariance)
-    untouched = run(controller(name))
-    assert not np.array_equal(untouched.weights, run(fast).weights)
 
 
 @pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])

@@ -47,9 +47,3 @@ def test_a_result_says_what_came_out():
     assert repr(result).endswith(f"output power {np.mean(result.control_signal[2000:] ** 2):.3g} (rated 1)>")
     assert "(rated" not in repr(replace(result, rated_power=None))
     assert repr(replace(result, diverged_at_s=0.125)).endswith("16000 Hz, diverged at 0.125 s>")
-
-
-def test_a_result_of_several_channels_counts_them():
-    text = repr(multichannel_result())
-    assert "2 loudspeaker(s), 3 microphone(s), noise reduction 11.6 dB, output power 0." in text
-    assert len(text.split("output power ")[1].split(" (")[0].split(", ")) == 2

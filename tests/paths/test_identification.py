@@ -128,11 +128,6 @@ def test_identification_refuses(changes, message):
         identify_secondary_path(PATH, **{"n_taps": 32, "duration_s": 0.1, **changes})
 
 
-def test_identification_wants_a_seed():
-    with pytest.raises(TypeError, match="rng must be a seed"):
-        identify_secondary_path(PATH, n_taps=32, duration_s=0.1, rng=None)
-
-
 @pytest.mark.parametrize(
     ("sent", "heard", "message"),
     [

@@ -175,12 +175,6 @@ def test_the_papers_short_paths_do_not_realise_20_hz():
     assert 15 < long.low_hz < 25
 
 
-def test_repr_of_a_causality_margin_is_the_margin():
-    early, late = np.eye(1, 30, 5)[0], np.eye(1, 30, 25)[0]
-    assert repr(causality_margin(late, early, fs=16000.0)) == "<CausalityMargin: 1.25 ms, 20 samples>"
-    assert repr(causality_margin(early, late, fs=16000.0)) == "<CausalityMargin: -1.25 ms, -20 samples>"
-
-
 def test_margins_of_several_channels_are_those_of_their_pairs():
     rng = np.random.default_rng(2)
     primary = rng.standard_normal((3, 2, 80)) * np.exp(-np.arange(80) / 20)

@@ -4,9 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-import scipy.signal
 
-from kfopc_filterpy import simulate
 from kfopc_filterpy.paths import causality_margin, group_delay, horizontal_plane, room_paths
 
 SIZE = np.array([5.0, 4.0, 2.5])
@@ -91,28 +89,6 @@ def test_every_reflection_is_there_with_the_absorption_of_its_walls():
 
 
 @needs_rooms
-def test_in_band_the_responses_are_those_of_pyroomacoustics_less_its_delay(pra):
-    paths = room_paths(SIZE, **PLACES, reverberation_time_s=0.2, n_taps=800)
-    filtered = pra.constants.get("rir_hpf_enable")
-    pra.constants.set("rir_hpf_enable", False)
-    absorption, _ = pra.inverse_sabine(0.2, SIZE)
-    room = pra.ShoeBox(SIZE, fs=int(FS), materials=pra.Material(absorption), max_order=15)
-    for place in (SOURCE, *LOUDSPEAKERS):
-        room.add_source(place)
-    room.add_microphone_array(np.array(MICROPHONES).T)
-    room.compute_rir()
-    pra.constants.set("rir_hpf_enable", filtered)
-    low_pass = scipy.signal.firwin(101, 0.35, fs=1.0)
-    delay = pra.constants.get("frac_delay_length") // 2
-    for k, i in itertools.product(range(3), range(3)):
-        theirs = room.rir[k][i][delay : delay + 800] / (4 * np.pi)
-        ours = (paths.primary[k, 0], *paths.secondary[k])[i]
-        filtered = [np.convolve(taps, low_pass, "valid") for taps in (ours, theirs)]
-        # Its window stands on whole samples and its delays are from a table: -40 dB is its accuracy.
-        assert 10 * np.log10(np.sum((filtered[0] - filtered[1]) ** 2) / np.sum(filtered[1] ** 2)) < -40
-
-
-@needs_rooms
 @pytest.mark.parametrize("reverberation_time_s", [0.15, 0.25])
 def test_the_decay_is_sabines_within_what_the_docstring_says(pra, reverberation_time_s):
     n_taps = int(1.3 * reverberation_time_s * 8000)
@@ -146,24 +122,6 @@ def test_speed_of_sound_and_sampling_rate_scale_the_arrivals():
 
 
 @needs_rooms
-def test_simulate_takes_the_paths():
-    class Loud:
-        def control_signal(self, reference):
-            return np.array([0.5, -0.25]) * reference[0]
-
-        def update(self, error):
-            pass
-
-    paths = room_paths(SIZE, **PLACES, reverberation_time_s=0.2, n_taps=256)
-    x = np.random.default_rng(0).standard_normal((1, 2000))
-    result = simulate(Loud(), x, primary_path=paths.primary, secondary_path=paths.secondary, fs=paths.fs)
-    for k in range(3):
-        alone = scipy.signal.lfilter(paths.primary[k, 0], 1.0, x[0])
-        heard = scipy.signal.lfilter(0.5 * paths.secondary[k, 0] - 0.25 * paths.secondary[k, 1], 1.0, x[0])
-        np.testing.assert_allclose(result.error[k], alone - heard, atol=1e-12)
-
-
-@needs_rooms
 def test_other_microphones_of_the_same_room():
     paths = room_paths(SIZE, **PLACES, absorption=UNEVEN, fs=8000.0, n_taps=200, speed_of_sound=340.0)
     again = paths.at(MICROPHONES[::-1])
@@ -191,20 +149,6 @@ def test_horizontal_plane_fills_the_room():
             horizontal_plane(*arguments)
     with pytest.raises(ValueError, match="spacing_m must be greater than 0"):
         horizontal_plane(SIZE, 1.0, spacing_m=0)
-
-
-@needs_rooms
-def test_repr_tells_the_room():
-    settings = {**PLACES, "n_taps": 256}
-    assert repr(room_paths(SIZE, **settings, reverberation_time_s=0.2)) == (
-        "<RoomPaths: 1 noise source(s), 2 loudspeaker(s), 3 microphone(s) in 5 x 4 x 2.5 m, 256 taps at 16000 Hz, "
-        "T60 = 0.2 s, cut off at -5 dB>"
-    )
-    free = room_paths(SIZE, **settings, absorption=1)
-    assert repr(free).endswith("256 taps at 16000 Hz, free field>")
-    assert (free.reverberation_time_s, free.decay_db) == (0.0, -np.inf)
-    with pytest.raises(AttributeError):
-        free.fs = 1.0
 
 
 @pytest.mark.parametrize(

@@ -216,17 +216,3 @@ def test_the_memory_is_in_seconds() -> None:
         powers.append(ours.disturbance_power)
     assert powers[0] == pytest.approx(powers[1], rel=CLOSE)
     assert powers[0] == pytest.approx(1.0 + 3.0 * math.exp(-1.0), rel=CLOSE)
-
-
-def test_a_bias_free_start_scales_a_steady_tone_right_at_once() -> None:
-    """A start from zero underestimates the power: the factor is far too large for long."""
-    fs, memory, samples = 16000.0, 0.5, 800
-    tone = 4.0 * np.sin(2 * np.pi * 400 / fs * np.arange(samples) + 0.3)
-    ours = OutputPowerConstraint(1.0, secondary_path_gain=1.0, fs=fs, memory_s=memory)
-    right = math.sqrt(1.0 / 8.0)
-    from_zero, forgetting = 0.0, math.exp(-1 / (fs * memory))
-    for value in tone:
-        factor = ours.advance(value)
-        from_zero = forgetting * from_zero + (1 - forgetting) * value**2
-    assert factor == pytest.approx(right, rel=0.01)  # 20 periods, of which the last is whole
-    assert min(math.sqrt(1.0 / from_zero), 1.0) > 2 * right
