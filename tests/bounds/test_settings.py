@@ -23,7 +23,7 @@ from kfopc_filterpy import (
     suggest_settings,
 )
 from kfopc_filterpy.bounds import measurement_noise_from_run, settings
-from kfopc_filterpy.signals import tone
+from kfopc_filterpy.signals import bursty_noise, tone
 
 S = np.array([0.0, 0.0, 0.8, 0.3])
 
@@ -159,6 +159,22 @@ def test_it_says_what_limits_the_length():
     assert short.n_taps == (400 - S.size + 2) // 11
     assert "as given" in suggest_settings(x, d, S, n_taps=64).reasons["n_taps"]
     assert "gains less than 0.1 dB" in suggest_settings(X, D, S).reasons["n_taps"]
+
+
+def test_a_noise_that_cannot_be_controlled_is_called_so():
+    other = np.random.default_rng(9).standard_normal(X.size)
+    suggested = suggest_settings(X, other, S)
+    assert suggested.n_taps == settings.MULTIPLE
+    assert "the causality margin and the coherence tell the cause" in suggested.reasons["n_taps"]
+    assert "by 0.0 dB" in suggested.reasons["n_taps"]
+    assert "causality margin" not in suggest_settings(X, D, S).reasons["n_taps"]
+
+
+def test_the_noise_in_bursts_is_called_so():
+    x = bursty_noise(2.0, fs=FS, rng=0)
+    d = np.convolve(x, np.eye(30)[25])[: x.size] + 0.01 * np.random.default_rng(0).standard_normal(x.size)
+    assert "because the noise comes in bursts" in suggest_settings(x, d, S).reasons["state_noise"]
+    assert "bursts" not in suggest_settings(X, D, S).reasons["state_noise"]
 
 
 # ---- What it refuses

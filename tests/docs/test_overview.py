@@ -6,7 +6,6 @@ import re
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,19 +43,3 @@ def test_the_caption_says_what_the_runs_give(runs, page):
 
 def test_the_bound_is_above_what_keeps_the_rated_power(overload, runs):
     assert runs["KF-PB"][0] < overload.bound(12.0) < runs["KF-PB"][0] + 0.5
-
-
-def test_the_figure_shows_each_algorithm_in_both_panels():
-    import matplotlib.pyplot as plt
-
-    found = {name: np.array([[12.0, 5.0], [0.5, 1.0 + k]]) for k, name in enumerate(overview.ALGORITHMS)}
-    figure = overview.draw([-3.0, 12.0], found, [12.5, 5.5])
-    figure.canvas.draw()
-    left, right = figure.axes
-    for name in overview.ALGORITHMS:
-        for ax, row in zip((left, right), found[name], strict=True):
-            (line,) = (line for line in ax.get_lines() if line.get_label() == overview.SAID[name])
-            assert list(line.get_ydata()) == list(row)
-    assert [text.get_text() for text in right.texts] == ["KF-OPC: 2.00 times", "KF-PB: 3.00 times"]
-    assert left.get_lines()[0].get_label() == "most within rated power"
-    plt.close(figure)
