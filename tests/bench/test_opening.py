@@ -23,10 +23,7 @@ def made(name, *claims, **changes):
         ([(POWER, False), (SPEED, False), (CLEAN, False)], "None of the 3 claims of the paper was reproduced."),
         ([(POWER, True)], "The one claim of the paper was reproduced."),
         ([(POWER, False)], "The one claim of the paper was not reproduced."),
-        (
-            [(POWER, True), (SPEED, False)],
-            "1 of the 2 claims of the paper was reproduced; the other is of a.",
-        ),
+        ([(POWER, True), (SPEED, False)], "1 of the 2 claims of the paper was reproduced; the other is of a."),
         ([], ""),
     ],
     ids=["all", "none", "one holds", "one fails", "one exception", "without"],

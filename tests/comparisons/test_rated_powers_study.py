@@ -11,14 +11,7 @@ from helpers.studies import few_settings, run_study, short_duct, smaller
 
 from comparisons.studies import rated_powers
 from comparisons.studies.cases import Case, make_case, noises
-from comparisons.studies.rated_powers import (
-    BOUND,
-    RECORD,
-    SCALED,
-    BudgetRow,
-    _claims,
-    mean_rows,
-)
+from comparisons.studies.rated_powers import BOUND, RECORD, SCALED, BudgetRow, _claims, mean_rows
 from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener
 from kfopc_filterpy.bench import StudyReport, run_setting, write_report
 from kfopc_filterpy.bench import registry as algorithms

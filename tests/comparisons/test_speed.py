@@ -23,10 +23,7 @@ BLOCK_TIMES = speed.block_times
 def small():
     """The study with few taps and samples, no compilation timed, and the same filters wherever it runs."""
     counts = {"TAPS": (128, 256), "ROUNDS": 1, "WORST_TAPS": (16,), "WORST_SAMPLES": 200, "CHANNEL_BLOCKS": 2}
-    own = {
-        "block_times": lambda: BLOCK_TIMES(6400),
-        "find_spec": lambda name: None,
-    }
+    own = {"block_times": lambda: BLOCK_TIMES(6400), "find_spec": lambda name: None}
     variants = {
         "CHANNELS": [(1, 2, 3, 16)],
         "BLOCK_CONTROLLERS": {"FxLMS, 256 taps": speed_variants.BLOCK_CONTROLLERS["FxLMS, 256 taps"]},

@@ -15,7 +15,7 @@ from comparisons.__main__ import main
 from comparisons.sweep.command import parsed_values
 from comparisons.sweep.grid import AXES, built_in_grid, own_grid
 from comparisons.sweep.jobs import as_figures
-from comparisons.sweep.results import cell_rows, mean_and_interval, sweep_figure, swept_axis, write_table
+from comparisons.sweep.results import cell_rows, mean_and_interval, sweep_figure, write_table
 from comparisons.sweep.run import run_sweep
 from comparisons.sweep.scenario import ScenarioError
 from comparisons.sweep.store import keep, kept
@@ -326,12 +326,6 @@ def test_arguments_that_do_not_fit_are_refused(tmp_path):
 
 
 # The figure.
-
-
-def test_figure_is_drawn_against_the_numbers_with_most_values():
-    grid = built_in_grid({"rated_power_db": [-10, 0], "n_taps": [16, 32, 64], "noise": ["tone", "bursts"]}, 1)
-    assert swept_axis(grid) == "n_taps"
-    assert swept_axis(built_in_grid({"noise": ["tone", "bursts"]}, 1)) == "noise"
 
 
 def test_figure_shows_the_means_and_intervals():

@@ -11,15 +11,7 @@ from helpers.studies import run_study, short_duct, smaller
 from comparisons.studies import cases, tracking
 from comparisons.studies import tracking_events as events
 from comparisons.studies.tracking import TrackingRow
-from comparisons.studies.tracking_events import (
-    CHIRP_HZ,
-    SWEEP_S,
-    Event,
-    change_scene,
-    jump_scene,
-    sweep,
-    sweep_scene,
-)
+from comparisons.studies.tracking_events import CHIRP_HZ, SWEEP_S, Event, change_scene, jump_scene, sweep, sweep_scene
 from kfopc_filterpy import convergence_time_s, noise_reduction_db, simulate
 from kfopc_filterpy.bench import StudyReport, make_controller
 from kfopc_filterpy.metrics import overshoot

@@ -17,16 +17,7 @@ from helpers.checkpoints import contents
 from helpers.controllers import ALL
 from helpers.simulation import X
 
-from kfopc_filterpy import (
-    KFOPC,
-    FxLMS,
-    KalmanController,
-    OutputLimiter,
-    OutputPowerConstraint,
-    kf_anc,
-    kf_opc,
-    kf_pb,
-)
+from kfopc_filterpy import KFOPC, FxLMS, KalmanController, OutputLimiter, OutputPowerConstraint, kf_anc, kf_opc, kf_pb
 from kfopc_filterpy.controllers import FeedbackNeutralizer, RefusedUpdate, VerifiedController
 
 FS = 4000.0

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import math
-import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -224,33 +223,6 @@ def test_a_missed_sample_is_a_prediction_only(kind: str) -> None:
     np.testing.assert_array_equal(kf.x, other.x)
     np.testing.assert_array_equal(kf.P, other.P)
     assert deep_equal(powers(kf), powers(other))
-
-
-@both_kinds
-def test_factor_power_and_gain_supplied_and_taken_back(kind: str) -> None:
-    x, rows, d = scene(40)
-    kf, untouched = make(kind, 0.5), make(kind, 0.5)
-
-    def step(k: int) -> None:
-        for f in (kf, untouched):
-            f.predict()
-            f.update(d[k], H=rows[k], reference=x[k])
-
-    for k in range(10):
-        step(k)
-    kf.constraint_factor = 0.125
-    step(10)
-    assert kf.constraint_factor == 0.125
-    assert kf.y.item() == pytest.approx(0.125 * d[10] - rows[10] @ kf.x_prior.reshape(-1), rel=1e-12)
-    kf.constraint_factor = None
-    kf.disturbance_power, kf.secondary_path_gain = 50.0, 4.0
-    step(11)
-    assert (kf.constraint_factor, kf.disturbance_power, kf.secondary_path_gain) == (0.2, 50.0, 4.0)
-    kf.disturbance_power = kf.secondary_path_gain = None
-    step(12)
-    assert kf.constraint_factor == untouched.constraint_factor  # the estimates went on all the while
-    assert kf.disturbance_power == untouched.disturbance_power
-    assert kf.secondary_path_gain == untouched.secondary_path_gain
 
 
 def test_without_a_rated_power() -> None:
@@ -552,22 +524,3 @@ def test_a_constraint_that_is_none_or_one_too_many_is_refused(make: Callable) ->
     with pytest.raises(TypeError, match="constraint must be an OutputPowerConstraint or None, got 'tight'"):
         kf.constraint = "tight"
     assert kf.constraint is None
-
-
-@both_kinds
-def test_a_filter_keeps_a_constraint_of_its_own(kind: str) -> None:
-    """The one given may serve other filters, and is not advanced."""
-    given = OutputPowerConstraint(0.5, fs=1000.0, memory_s=0.1, window="sliding", secondary_path_gain=2.0)
-    before = pickle.dumps(given)
-    one, other = make(kind), make(kind)
-    for kf in (one, other):
-        kf.constraint = given
-        assert kf.constraint is not given
-    one.update(4.0, H=ROW)
-    assert (one.disturbance_power, other.disturbance_power) == (16.0, 0.0)
-    assert pickle.dumps(given) == before
-    assert (one.constraint.window, one.constraint.memory_s, one.constraint.fs) == ("sliding", 0.1, 1000.0)
-    one.constraint = None
-    assert (one.rated_power, one.constraint_factor) == (None, 1.0)
-    with pytest.raises(ValueError, match="set rated_power first"):
-        one.disturbance_power = 1.0

@@ -31,13 +31,7 @@ def test_the_random_walk_filter(column: bool) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        KFOPC,
-        lambda n: KFOPC.random_walk(n, **NOISES),
-    ],
-)
+@pytest.mark.parametrize("make", [KFOPC, lambda n: KFOPC.random_walk(n, **NOISES)])
 def test_up_to_eight_states_all_is_shown(make: Any) -> None:
     text = repr(make(8))
     assert text.startswith(f"{type(make(8)).__name__} object\ndim_x = 8\n")
