@@ -14,6 +14,8 @@ from comparisons.studies.cases import FS
 from kfopc_filterpy import kf_pb, noise_reduction_db, simulate
 from kfopc_filterpy.bench import StudyReport
 
+pytestmark = pytest.mark.slow  # the run of the small study takes longest of all, and no other test needs it
+
 PRIMARY, SECONDARY = np.array([0.0] * 6 + [1.0, 0.5, 0.25]), np.array([0.0, 0.0, 1.0, -0.6, 0.2])
 SMALL = {"N_TAPS": 16, "SILENT_S": 1.0, "DURATION_S": 5.0, "SHARES": (0.25,)}
 
