@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import sys
+from importlib import metadata
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "extensions"))
@@ -13,6 +14,7 @@ os.environ.pop("MPLBACKEND", None)  # notebooks draw inline; with another backen
 os.environ["MATPLOTLIBRC"] = str(Path(__file__).parent / "matplotlibrc")
 
 project = "kfopc_filterpy"
+version = metadata.version(project)
 author = "The kfopc_filterpy developers"
 copyright = author
 exclude_patterns = ["_build", "figures", "**.ipynb_checkpoints"]
@@ -21,8 +23,12 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.linkcode",
     "sphinx.ext.mathjax",
+    "sphinx.ext.intersphinx",
     "numpydoc",
     "myst_nb",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "search_words",  # docs/extensions: words that the search ranks first
     "source_lines",  # docs/extensions: the package's source with line numbers, and links into it
     "public_names",  # docs/extensions: a reference page for each public name
     "listening",  # docs/extensions: the C core as WebAssembly, for the page that plays
@@ -66,7 +72,9 @@ linkcheck_allow_unauthorized = True
 html_theme = "furo"
 html_static_path = ["_static", mathjax_file()]
 html_css_files = ["wide.css"]
-html_title = "kfopc_filterpy"
+html_title = f"{project} {version}"
+html_search_scorer = str(Path(__file__).parent / "extensions" / "scorer.js")
+copybutton_exclude = ".linenos, .gp, .go"  # what is copied has no prompts and no output
 html_copy_source = False
 html_show_copyright = False
 html_theme_options = {"sidebar_hide_name": False, "navigation_with_keys": True}
@@ -81,13 +89,31 @@ def spread_notebooks(app, env, docnames):
     docnames += [name for name in others if name not in docnames]
 
 
+def reachable(host):
+    """Return whether a host answers."""
+    try:
+        socket.create_connection((host, 443), timeout=2).close()
+    except OSError:
+        return False
+    return True
+
+
+# Names of these packages in docstrings are links, if their pages can be reached during the build.
+pages = {
+    "python": "docs.python.org/3",
+    "numpy": "numpy.org/doc/stable",
+    "scipy": "docs.scipy.org/doc/scipy",
+    "control": "python-control.readthedocs.io/en/latest",
+    "matplotlib": "matplotlib.org/stable",
+}
+intersphinx_mapping = {
+    name: (f"https://{page}/", None) for name, page in pages.items() if reachable(page.partition("/")[0])
+}
+
+
 def leave_links_offline(app):
     """If there is no network, check no external links and say so."""
-    if app.builder.name != "linkcheck":
-        return
-    try:
-        socket.getaddrinfo("github.com", 443)
-    except OSError:
+    if app.builder.name == "linkcheck" and not reachable("github.com"):
         print("offline: external links are not checked")
         app.config.linkcheck_ignore.append("https?://.*")
 

@@ -25,6 +25,21 @@ NAMESPACES = (
     "bench",
 )
 
+TASKS = {  # what the names of a folder are for
+    "loop": "Simulate a run",
+    "controllers": "Choose a controller, or write one",
+    "filters": "Extend filterpy",
+    "power": "Keep a rated power",
+    "bounds": "Ask what is possible, and with which settings",
+    "metrics": "Measure a run",
+    "plot": "Draw figures",
+    "signals": "Read recordings, make noises",
+    "paths": "Model, measure and judge paths",
+    "bench": "Rate an amplifier, compare and tune algorithms",
+    "realtime": "Run in real time",
+    "export": "Take a controller to a board",
+}
+
 
 def names_of(namespace: str) -> list[str]:
     """Return the public names of a namespace ("" is the package itself) that no namespace before it has."""
@@ -59,16 +74,16 @@ def name_page(name: str) -> str:
 
 
 def index_page() -> str:
-    """Return the table of all public names, by namespace."""
+    """Return the tables of all public names, by task: each folder of the package serves one."""
     title = "API reference"
     lines = [title, "=" * len(title), ""]
-    for space in NAMESPACES:
-        full = f"kfopc_filterpy.{space}" if space else "kfopc_filterpy"
-        lines += [full, "-" * len(full), "", summary(importlib.import_module(full)), ""]
-        lines += [".. list-table::", "   :widths: 35 65", ""]
-        for name in names_of(space):
-            dotted = f"{space}.{name}" if space else name
-            lines += [f"   * - :doc:`{name} <{dotted}>`", f"     - {summary(thing_of(dotted))}"]
+    folders = {
+        name: name.split(".")[0] if "." in name else thing_of(name).__module__.split(".")[1] for name in public_names()
+    }
+    for folder, task in TASKS.items():
+        lines += [task, "-" * len(task), "", ".. list-table::", "   :widths: 35 65", ""]
+        for name in [name for name in folders if folders[name] == folder]:
+            lines += [f"   * - :doc:`{name} <{name}>`", f"     - {summary(thing_of(name))}"]
         lines.append("")
     return "\n".join([*lines, ".. toctree::", "   :hidden:", "", *(f"   {name}" for name in public_names()), ""])
 
