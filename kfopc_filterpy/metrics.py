@@ -588,7 +588,11 @@ def a_weighting_db(frequencies_hz: ArrayLike) -> np.ndarray:
 
     It is the formula of IEC 61672-1 with the poles at 20.6, 107.7, 737.9 and 12194 Hz:
 
-    .. math:: A(f) = 20 \log_{10} \frac{f_4^2 f^4}{(f^2 + f_1^2) \sqrt{(f^2 + f_2^2)(f^2 + f_3^2)} (f^2 + f_4^2)} - A_{1000}
+    .. math::
+
+       A(f) &= 20 \log_{10} R(f) - A_{1000}
+
+       R(f) &= \frac{f^2}{f^2 + f_1^2}\, \frac{f}{\sqrt{f^2 + f_2^2}}\, \frac{f}{\sqrt{f^2 + f_3^2}}\, \frac{f_4^2}{f^2 + f_4^2}
 
     Parameters
     ----------

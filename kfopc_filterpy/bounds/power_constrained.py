@@ -235,7 +235,13 @@ def power_constrained_wiener(
 
     Minimises :math:`E[(d - w^T x')^2]` subject to :math:`E[(w^T x)^2] ≤ ρ_o`. The problem is convex, and its solution
 
-    .. math:: (R_{x'} + λ R_x)\, w = r, \qquad λ ≥ 0, \qquad λ\,(E[y^2] - ρ_o) = 0
+    .. math::
+
+       (R_{x'} + λ R_x)\, w = r,
+
+       λ ≥ 0,
+
+       λ\,(E[y^2] - ρ_o) = 0
 
     is a bound: no filter of `n_taps` taps that stays fixed over the stretch does better within the power, unless its
     weights are very large in the directions left out (below). A filter that adapts may do better if the noise changes within the stretch. The bound is fitted to the stretch it is judged on, so

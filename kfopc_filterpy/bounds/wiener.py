@@ -72,7 +72,7 @@ def wiener_solution(
 ) -> WienerSolution:
     r"""Return the least-squares control filter of a reference and a disturbance.
 
-    Minimises :math:`E[(d - w^T x')^2] + \gamma E[(w^T x)^2] + \lambda E[x'^2] \|w\|^2` over the samples at which the
+    Minimises :math:`E[(d - w^T x')^2] + \gamma E[(w^T x)^2]` :math:`+ \lambda E[x'^2] \|w\|^2` over the samples at which the
     delay lines of control filter and secondary path are full: least squares on the data at hand, not the biased
     autocorrelation. Leave out the start-up transient of the disturbance if it should not count. If the data leave
     weights undetermined (a tone determines only two numbers), the solution of minimum norm is taken.

@@ -15,8 +15,17 @@ from .core_controller import CoreController, setting
 class DiagonalKalman(CoreController):
     r"""Reduced-complexity Kalman filter: eq. 2-9 with P reduced to its diagonal p, an NLMS with a step for each tap.
 
-    .. math:: p \leftarrow p + r, \quad S = \sum_i p_i x_i'^2 + q, \quad K_i = p_i x'_i / S, \quad
-       w \leftarrow w + K (\alpha \hat d - w^T x'), \quad p_i \leftarrow (1 - K_i x'_i) p_i
+    .. math::
+
+       p \leftarrow p + r,
+
+       S = \sum_i p_i x_i'^2 + q,
+
+       K_i = p_i x'_i / S,
+
+       w \leftarrow w + K (\alpha \hat d - w^T x'),
+
+       p_i \leftarrow (1 - K_i x'_i) p_i
 
     It ignores the correlation between neighbouring taps of a coloured reference. It therefore converges like NLMS: the
     narrower the band, the slower it is than the full filter. On a white reference it comes close to the full filter

@@ -23,8 +23,13 @@ class DirectKalman(CoreController):
     KF-OPC scales all measurements by one factor. Eq. 13 gives a factor for each loudspeaker as if it were alone; the
     smallest of them is used:
 
-    .. math:: \alpha = \min_j \min\{\sqrt{\rho_j G_j / \delta_d^2},\ 1\}, \qquad
-        G_j = \frac{\sum_{k,i} E[x_{kji}'^2]}{\sum_i E[x_i^2]}, \qquad \delta_d^2 = \sum_k E[\hat d_k^2]
+    .. math::
+
+       \alpha = \min_j \min\{\sqrt{\rho_j G_j / \delta_d^2},\ 1\},
+
+       G_j = \frac{\sum_{k,i} E[x_{kji}'^2]}{\sum_i E[x_i^2]},
+
+       \delta_d^2 = \sum_k E[\hat d_k^2]
 
     This extension is the package's, not the paper's. With one loudspeaker, microphone and reference it is eq. 13. A
     loudspeaker that no microphone hears, :math:`G_j = 0`, is left out: its control filters stay zero.

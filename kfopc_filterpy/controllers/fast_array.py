@@ -80,16 +80,21 @@ class FastArrayKalman(CoreController):
     It uses the shift of the row by one sample at a time. Let P be in units of the measurement noise, u(n) = x'(n)^T the
     row and :math:`\gamma^{-1}(n) = 1 + \lambda^{-1} u(n) P(n-1) u(n)^T`. Successive rows share all but one sample, so
 
-    .. math:: \lambda^{-1} \left( \begin{bmatrix} P(n) & 0 \\ 0 & 0 \end{bmatrix} -
-       \begin{bmatrix} 0 & 0 \\ 0 & P(n-1) \end{bmatrix} \right) = B(n)\, \mathrm{diag}(1, -1)\, B(n)^T
+    .. math::
+
+       \lambda^{-1} &\left( \begin{bmatrix} P(n) & 0 \\ 0 & 0 \end{bmatrix} -
+       \begin{bmatrix} 0 & 0 \\ 0 & P(n-1) \end{bmatrix} \right) \\
+       &= B(n)\, \mathrm{diag}(1, -1)\, B(n)^T
 
     keeps its rank of two, which it has at the start if P(-1) = eta diag(lambda^2, ..., lambda^{L+1}). One orthogonal and
     one hyperbolic rotation, which zero the second and third entry of the first row below, then update gain g, gamma and
     B together:
 
-    .. math:: \begin{bmatrix} \gamma^{-1/2}(n) & \bar u(n+1) B(n) \\
-       \begin{bmatrix} 0 \\ g(n) \gamma^{-1/2}(n) \end{bmatrix} & B(n) \end{bmatrix} \Theta =
-       \begin{bmatrix} \gamma^{-1/2}(n+1) & 0 \\
+    .. math::
+
+       \begin{bmatrix} \gamma^{-1/2}(n) & \bar u(n+1) B(n) \\
+       \begin{bmatrix} 0 \\ g(n) \gamma^{-1/2}(n) \end{bmatrix} & B(n) \end{bmatrix} \Theta \\
+       = \begin{bmatrix} \gamma^{-1/2}(n+1) & 0 \\
        \begin{bmatrix} g(n+1) \gamma^{-1/2}(n+1) \\ 0 \end{bmatrix} & \lambda^{1/2} B(n+1) \end{bmatrix}
 
     with :math:`\bar u(n+1)` the L + 1 newest samples. With forgetting, rounding errors grow by the factor 1/lambda per

@@ -13,7 +13,11 @@ class FxLMS(CoreController):
     With K microphones, J loudspeakers and I references it is the multiple-error LMS (MEFxLMS), which descends the
     gradient of the sum of the squared errors:
 
-    .. math:: w_{ji}(n+1) = w_{ji}(n) + \mu \sum_k e_k(n)\, x'_{kji}(n), \qquad x'_{kji} = \hat s_{kj} * x_i
+    .. math::
+
+       w_{ji}(n+1) = w_{ji}(n) + \mu \sum_k e_k(n)\, x'_{kji}(n),
+
+       x'_{kji} = \hat s_{kj} * x_i
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ class FxNLMS(CoreController):
     thousand filter lengths. With several channels, the steps of all filters are divided by the same energy, that of all
     filtered references together. So their direction remains that of the multiple-error LMS:
 
-    .. math:: w_{ji}(n+1) = w_{ji}(n) + \mu \frac{\sum_k e_k(n)\, x'_{kji}(n)}
+    .. math:: w_{ji}(n+1) &= w_{ji}(n) \\ &\quad + \mu \frac{\sum_k e_k(n)\, x'_{kji}(n)}
        {\sum_{k,j,i} x'_{kji}(n)^T x'_{kji}(n)}
 
     Parameters

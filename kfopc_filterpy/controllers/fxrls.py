@@ -22,7 +22,12 @@ def fx_rls(
 ) -> DirectKalman:
     r"""Return FxRLS, which minimises :math:`\sum_k \lambda^{n-k} (\hat d(k) - w^T x'(k))^2` without a constraint.
 
-    .. math:: K = \frac{P x'}{\lambda + x'^T P x'}, \qquad w \leftarrow w + K (\hat d - x'^T w), \qquad
+    .. math::
+
+       K = \frac{P x'}{\lambda + x'^T P x'},
+
+       w \leftarrow w + K (\hat d - x'^T w),
+
        P \leftarrow (P - K x'^T P) / \lambda
 
     P starts at `initial_variance` I. This is the Kalman filter with r = 0, q = 1 and filterpy's fading memory

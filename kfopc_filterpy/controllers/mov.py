@@ -60,8 +60,11 @@ def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_pa
 class MOVFxLMS(CoreController):
     r"""Minimum-output-variance FxLMS: FxLMS with a penalty that keeps the control power within the rated power.
 
-    .. math:: w(n+1) = w(n) + \mu [e(n) x'(n) - \gamma y(n) x(n)], \qquad
-       \gamma = \max\{G_s (\sqrt{\delta_d^2 / (\rho_o G_s)} - 1), 0\}
+    .. math::
+
+       w \leftarrow w + \mu\, (e x' - \gamma y x),
+
+       \gamma = G_s \max\{\sqrt{\delta_d^2 / (\rho_o G_s)} - 1,\ 0\}
 
     For a flat path, :math:`G_s / (G_s + \gamma)` is then the constraint factor of eq. 13. The powers are estimated as
     in KF-OPC, so the penalty varies with the noise (Lai et al. 2023); the argument `penalty_factor` fixes it (Shi et

@@ -8,7 +8,7 @@ from .clipping import ClippingFxLMS
 class RescalingFxLMS(ClippingFxLMS):
     r"""Re-scaling FxLMS: a control signal beyond the limit is clipped, and the weights are scaled by the same ratio.
 
-    .. math:: \text{if } |w(n)^T x(n)| > A: \quad w(n) \leftarrow w(n) \frac{A}{|w(n)^T x(n)|}
+    .. math:: \text{if } |w(n)^T x(n)| > A: \\ w(n) \leftarrow w(n) \frac{A}{|w(n)^T x(n)|}
 
     The step of `FxLMS` follows. Between two such samples the filter is linear. With several loudspeakers, each has its
     own limit, and only the control filters of a loudspeaker beyond it are scaled.

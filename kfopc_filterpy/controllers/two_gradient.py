@@ -10,7 +10,7 @@ from .core_controller import CoreController, setting
 class TwoGradientFxLMS(CoreController):
     r"""Two-gradient-direction FxLMS: it reduces the error within the limit and the control power beyond it.
 
-    .. math:: w(n+1) = w(n) + \begin{cases} \mu\, e(n)\, x'(n) & |y(n)| \le A \\
+    .. math:: w(n+1) &= w(n) \\ &\quad + \begin{cases} \mu\, e(n)\, x'(n) & |y(n)| \le A \\
        -\mu_y\, y(n)\, x(n) & |y(n)| > A \end{cases}
 
     The control signal is not clipped. It settles above the limit, at the balance of the two directions, and closer to

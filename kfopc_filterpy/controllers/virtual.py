@@ -43,15 +43,31 @@ class KalmanObserver:
 
     The noise sources are white, and a state-space model leads from them to all microphones:
 
-    .. math:: z(n+1) = A z(n) + B v(n), \quad d_p(n) = C_p z(n) + D_p v(n) + \eta(n), \quad d_v(n) = C_v z(n) + D_v v(n)
+    .. math::
+
+       z(n+1) = A z(n) + B v(n),
+
+       d_p(n) = C_p z(n) + D_p v(n) + \eta(n),
+
+       d_v(n) = C_v z(n) + D_v v(n)
 
     With the covariances Q of v and R of the microphones' own noise :math:`\eta`, and the solution P of the Riccati
     equation, the best estimate from the present and the past is
 
-    .. math:: \epsilon = d_p - C_p \hat z, \quad \hat d_v = C_v \hat z + M \epsilon, \quad
+    .. math::
+
+       \epsilon = d_p - C_p \hat z,
+
+       \hat d_v = C_v \hat z + M \epsilon,
+
        \hat z \leftarrow A \hat z + K \epsilon
 
-    .. math:: S = C_p P C_p^T + D_p Q D_p^T + R, \quad K = (A P C_p^T + B Q D_p^T) S^{-1}, \quad
+    .. math::
+
+       S = C_p P C_p^T + D_p Q D_p^T + R,
+
+       K = (A P C_p^T + B Q D_p^T) S^{-1},
+
        M = (C_v P C_p^T + D_v Q D_p^T) S^{-1}
 
     In the paper of Petersen et al. the control signals are further inputs of the model. Their contribution to the state
@@ -181,7 +197,12 @@ class VirtualMicrophones(WrappedController):
     It receives the errors of all microphones of the plant, but uses only those of the physical ones. From these it
     estimates the errors at the virtual microphones, and `controller` adapts to the estimates:
 
-    .. math:: \hat d_p = e_p + \hat s_p * y, \qquad \hat d_v = \mathrm{observer}(\hat d_p), \qquad
+    .. math::
+
+       \hat d_p = e_p + \hat s_p * y,
+
+       \hat d_v = \mathrm{observer}(\hat d_p),
+
        \hat e_v = \hat d_v - \hat s_v * y
 
     With observation filters as the observer, :math:`\hat d_v = O * \hat d_p`, this is the remote-microphone technique;

@@ -43,7 +43,10 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     The measurement is scaled by the constraint factor before it corrects the state (eq. 9),
 
-    .. math:: \hat w(n|n) = \hat w(n|n-1) + K(n) [\alpha \hat d(n) - x'^T(n) \hat w(n|n-1)]
+    .. math::
+
+       \hat w(n|n) &= \hat w(n|n-1) \\
+       &\ + K(n) [\alpha \hat d(n) - x'^T(n) \hat w(n|n-1)]
 
     With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except that
     arguments that would corrupt that filter (NaN, Inf, complex numbers, a wrong shape, a negative variance, a P that is

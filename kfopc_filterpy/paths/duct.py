@@ -161,8 +161,13 @@ def duct_paths(
 
     All images of a source at :math:`x_s` sum up, at a microphone at :math:`x > x_s`, to
 
-    .. math:: G(x, x_s) = \frac{(g(x - x_s) + r_0 g(x + x_s)) (1 + r_L g(2L - 2x))}{1 - r_0 r_L g(2L)},
-              \quad g(l) = e^{-j 2\pi f l / c - (1 + j) a l \sqrt{f / 1\,\mathrm{kHz}}},
+    .. math::
+
+       G(x, x_s) &= \frac{1 + r_L g(2L - 2x)}{1 - r_0 r_L g(2L)}\, h(x, x_s),
+
+       h(x, x_s) &= g(x - x_s) + r_0 g(x + x_s),
+
+       g(l) &= e^{-j 2\pi f l / c - (1 + j) a l \sqrt{f / 1\,\mathrm{kHz}}},
 
     where `g` carries the wave over a length: its delay, which need not be whole samples, and the loss at the walls with
     the dispersion that keeps it causal. The secondary path is G from the loudspeaker, times a second-order high-pass

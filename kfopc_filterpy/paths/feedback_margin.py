@@ -71,7 +71,10 @@ def feedback_margin(
     The control signal reaches the reference microphone through the feedback path, and a `FeedbackNeutralizer` subtracts
     what the estimate of this path predicts:
 
-    .. math:: y = w * (x + (f - \hat f) * y) \quad\Rightarrow\quad Y = \frac{W}{1 - W (F - \hat F)} X
+    .. math::
+
+       y = w * (x + (f - \hat f) * y) \\
+       \Rightarrow\quad Y = \frac{W}{1 - W (F - \hat F)} X
 
     Parameters
     ----------
