@@ -10,26 +10,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._types import NumberOrArray, PathModels, PerLoudspeaker
-from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_channel, per_loudspeaker
+from .._validate import as_channels, as_count, as_positive, as_signal, per_channel, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..core.block import Algorithm, Block, InUse, Shape, reason_of
 from ..core.own import load_algorithm as load_algorithm
 from ..core.run_loop import REFUSED_REFERENCE, Steps, process
-from ..paths.path_matrix import is_path_matrix, secondary_paths, single_path
 from ..paths.uncertainty import Uncertainty, as_uncertainty, guard_filter
 from ..power.amplifiers import Amplifiers, amplifier_models
 from ..power.constraint import NUMBERS, Constraints, OutputPowerConstraint
 from ..power.limiter import Limiters, OutputLimiter
 from .base import Looped, calls_of, constraint_for, listed, require_rates
-from .channel_samples import channel_sample
+from .channels import Channels
 from .processing import (
     BlockProcessing,
     RefusedUpdate,
     adapt_flags,
-    block_signal,
     output_array,
     require_apart,
-    require_channels,
     require_one_length,
 )
 
@@ -62,7 +59,7 @@ class setting:
             controller._opened().fields[self.name][:] = controller._checked_setting(self.name, value)
 
 
-class CoreController(BlockProcessing, Checkpointed):
+class CoreController(Channels, BlockProcessing, Checkpointed):
     """Base class of the built-in controllers: channels, paths, limiter, constraint, and an algorithm of the core.
 
     A subclass names its `algorithm` in C and the `checks` of its settings, and passes the settings by their names in C.
@@ -166,33 +163,6 @@ class CoreController(BlockProcessing, Checkpointed):
 
     # Channels: numbers with one, arrays with several.
 
-    def _read_paths(self, paths: Any, n_references: int | None, multichannel: bool | None) -> np.ndarray:
-        """Set the numbers of channels and return the taps of the secondary path."""
-        several = is_path_matrix(paths)
-        if several and n_references is None:
-            raise ValueError(
-                f"{type(self).__name__} takes one channel: secondary_path must be one-dimensional, (taps,), or a system "
-                "of one input and one output. Controllers with the setting n_references take several channels, for "
-                "example kf_anc, kf_opc, kf_pb and FxLMS"
-            )
-        self.n_references = 1 if n_references is None else as_count(n_references, "n_references")
-        self.multichannel = several or self.n_references > 1 if multichannel is None else multichannel
-        self.n_microphones, self.n_loudspeakers = 1, 1
-        secondary, self._path_fs = self._taps_and_rate(paths)
-        if self.multichannel:
-            self.n_microphones, self.n_loudspeakers, _ = secondary.shape
-        return secondary
-
-    def _taps_and_rate(self, paths: Any) -> tuple[np.ndarray, float | None]:
-        """Return secondary paths as taps, (K, J, taps) or (taps,), and their sampling rate in Hz if systems tell it."""
-        return secondary_paths(paths) if self.multichannel else single_path(paths, "secondary_path")
-
-    def _sample(self, value: Any, name: str, what: str) -> Any:
-        """Return a checked sample: a number, or with several channels an array of them; `what` names the channels."""
-        if self.multichannel:
-            return channel_sample(value, getattr(self, f"n_{what}"), name, what)
-        return as_number(value, name)
-
     def _shaped(self, values: np.ndarray) -> Any:
         """Return the core's value of each channel: a number, or with several channels a copy."""
         return values.copy() if self.multichannel else float(values[0])
@@ -260,24 +230,6 @@ class CoreController(BlockProcessing, Checkpointed):
     def _estimated_path(self) -> np.ndarray:
         """Return the estimated secondary path in the core's memory: the steps use what is written into it."""
         return self._by_channel("secondary_path")
-
-    def _checked_estimate(self, path: Any) -> np.ndarray:
-        """Return the taps of a new estimate, filled with zeros to the length of the present one."""
-        present = self._estimated_path().shape
-        taps, rate = self._taps_and_rate(path)
-        if taps.shape[:-1] != present[:-1]:
-            raise ValueError(
-                f"secondary_path must have the channels (microphones, loudspeakers) = {present[:-1]} of the present "
-                f"estimate, got {taps.shape[:-1]}: make a new controller for other channels"
-            )
-        if taps.shape[-1] > present[-1]:
-            raise ValueError(
-                f"secondary_path must have at most the {present[-1]} taps of the present estimate, got "
-                f"{taps.shape[-1]}: make the controller with an estimate filled with zeros to the longest path"
-            )
-        if self._path_fs is not None:
-            require_rates(self._path_fs, {"new secondary path": rate})
-        return np.pad(taps, [(0, 0)] * (taps.ndim - 1) + [(0, present[-1] - taps.shape[-1])])
 
     # The block.
 
@@ -375,7 +327,8 @@ class CoreController(BlockProcessing, Checkpointed):
 
     @secondary_path.setter
     def secondary_path(self, path: PathModels) -> None:
-        before, after = self.secondary_path, self._checked_estimate(path)
+        before = self.secondary_path
+        after = self._checked_estimate(path, before.shape)
         guard_filter(self._uncertainty, after)  # raises if none can be made, before anything changes
         with self.in_use:
             self._estimated_path()[:] = after
@@ -565,12 +518,6 @@ class CoreController(BlockProcessing, Checkpointed):
                 if done < end:
                     self._raise_refusal(x[..., done], e[..., done], done, status)
         return y
-
-    def _block_signal(self, value: Any, name: str, n_channels: int) -> np.ndarray:
-        """Return a block of samples, (n_samples,) or (n_channels, n_samples)."""
-        signal = block_signal(value, name)
-        require_channels(signal, name, self.multichannel, n_channels)
-        return np.ascontiguousarray(signal)
 
     def _raise_refusal(self, reference: Any, error: Any, sample: int, status: int) -> None:
         """Call a refused step again, which changes nothing, and raise `RefusedUpdate` with its reason."""

@@ -1,0 +1,254 @@
+"""The base class of the controllers that adapt once per block of samples, in numpy: signals, spectra, delayless output."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.fft import irfft, next_fast_len, rfft
+
+from .._types import NumberOrArray, PathModels
+from .._validate import as_count
+from ..checkpoint import Checkpointed
+from .base import calls_of, require_rates
+from .channel_samples import LOUDEST, require_moderate
+from .channels import Channels
+from .processing import BlockProcessing, adapt_flags, output_array, require_apart, require_one_length
+
+
+class BlockController(Channels, BlockProcessing, Checkpointed):
+    r"""Base class of the block controllers: the control filter stays as it is for B samples, then `_adapt` changes it.
+
+    The control filter is kept as spectra of P partitions with N taps each. A block of B samples is filtered by overlap-save
+    with transforms of N + B samples. The control signal has no delay: what the samples before the block contribute to it
+    is computed when the block begins, and what the block's own samples contribute takes B multiplications per sample,
+
+    .. math:: y(n_0 + i) = \sum_{l=0}^{i} w_l\, x(n_0 + i - l) + \sum_{l>i} w_l\, x(n_0 + i - l)
+
+    Parameters
+    ----------
+    n_taps : int
+        Taps L of the control filter, or of each of them.
+    secondary_path : array_like, shape (taps,) or (K, J, taps), or control system
+        Estimated secondary path, as for `FxLMS`.
+    block_size : int
+        Samples B of a block.
+    partition_size : int
+        Taps N of a partition, a multiple of B.
+    n_references : int
+        Number of references I.
+    """
+
+    name = "block controller"
+
+    def __init__(
+        self,
+        n_taps: int,
+        secondary_path: PathModels,
+        *,
+        block_size: int,
+        partition_size: int | None,
+        n_references: int,
+    ) -> None:
+        self.n_taps = as_count(n_taps, "n_taps")
+        path = self._read_paths(secondary_path, n_references, None)
+        B = self.block_size = as_count(block_size, "block_size")
+        N = self.partition_size = B if partition_size is None else as_count(partition_size, "partition_size")
+        if N % B:
+            raise ValueError(
+                f"partition_size must be a multiple of block_size = {B}, got {N}: the spectra of earlier blocks are used again"
+            )
+        K, J, I = self.n_microphones, self.n_loudspeakers, self.n_references  # noqa: E741
+        P = self.n_partitions = -(-self.n_taps // N)
+        self._every = N // B  # blocks between the spectra of neighbouring partitions
+        spectra, bins = (P - 1) * self._every + 1, (N + B) // 2 + 1
+        self._take_path(path)
+        # Signals run forward in time, up to the end of the last block.
+        self._references = np.zeros((I, (P - 1) * N + self._window))
+        self._emitted = np.zeros((J, self._window))
+        self._now = np.zeros((I, 2 * B - 1))  # the references of this block, after zeros
+        self._played, self._errors = np.zeros((J, B)), np.zeros((K, B))  # control signals and errors of this block
+        self._n, self._adapting = 0, False  # samples of this block; whether an error of it was taken
+        # Spectra of N + B samples, the newest block first.
+        self._X = np.zeros((I, spectra, bins), dtype=complex)
+        self._X_filtered = np.zeros((K, J, I, spectra, bins), dtype=complex)
+        self._W = np.zeros((J, I, P, bins), dtype=complex)
+        self._earlier = np.zeros((J, B))  # what the samples before this block contribute to its control signals
+        self._first_taps = np.zeros((J, I, B))  # the last of them first
+
+    # The secondary path.
+
+    def _take_path(self, path: np.ndarray) -> None:
+        self._path = path
+        size = self.partition_size + self.block_size + path.shape[-1] - 1
+        self._window = next_fast_len(size, real=True)
+        paths = path.reshape(self.n_microphones, self.n_loudspeakers, 1, -1)
+        self._S = rfft(paths, self._window)
+
+    @property
+    def secondary_path(self) -> np.ndarray:
+        """Estimated secondary path s^, (n_path,), or with several channels (K, J, n_path); a copy.
+
+        A new estimate can be assigned between two samples: taps or an FIR system, or paths with the same channels, no
+        longer than the present estimate. The stored references are filtered again with it; the weights stay.
+        """
+        return self._path.copy()
+
+    @secondary_path.setter
+    def secondary_path(self, path: PathModels) -> None:
+        self._take_path(self._checked_estimate(path, self._path.shape))
+        for back in range(self._X_filtered.shape[-2]):
+            self._X_filtered[..., back, :] = self._filtered_spectrum(back)
+
+    def _filtered_spectrum(self, back: int = 0) -> np.ndarray:
+        """Return the spectrum of the filtered references at the end of a block, so many blocks back, (K, J, I, bins)."""
+        end = self._references.shape[1] - back * self.block_size
+        x = rfft(self._references[:, end - self._window : end])
+        return rfft(self._newest(irfft(x * self._S, self._window)))
+
+    def _newest(self, signal: np.ndarray) -> np.ndarray:
+        """Return the newest N + B samples."""
+        return signal[..., -(self.partition_size + self.block_size) :]
+
+    # The control filter.
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Control filter w, (L,), or with several channels (J, I, L), newest-sample tap first; a copy."""
+        w = self._partitions(self._W).reshape(self.n_loudspeakers, self.n_references, -1)[..., : self.n_taps]
+        return w if self.multichannel else w[0, 0]
+
+    def _partitions(self, spectra: np.ndarray) -> np.ndarray:
+        """Return the taps of partitions, (..., N); the taps beyond N of their transforms are left out."""
+        return irfft(spectra, self.partition_size + self.block_size)[..., : self.partition_size]
+
+    def _spectra(self, partitions: np.ndarray) -> np.ndarray:
+        """Return the spectra of partitions (..., N)."""
+        return rfft(partitions, self.partition_size + self.block_size)
+
+    def _block_spectrum(self, block: np.ndarray) -> np.ndarray:
+        """Return the spectra of blocks (..., B) of which the samples before are zero."""
+        return rfft(np.concatenate((np.zeros((*block.shape[:-1], self.partition_size)), block), axis=-1))
+
+    def _block_of(self, spectra: np.ndarray) -> np.ndarray:
+        """Return what overlap-save keeps of filtered spectra, the last B samples, (..., B)."""
+        return irfft(spectra, self.partition_size + self.block_size)[..., self.partition_size :]
+
+    def _adapt(self) -> None:
+        """Change the control filter's spectra after a block, of which at least one error was taken."""
+        raise NotImplementedError
+
+    def _follow(self) -> None:
+        """Follow the filtered references of a block, also if no error was taken."""
+
+    def _end_block(self) -> None:
+        B, N = self.block_size, self.partition_size
+        self._references = np.concatenate((self._references[:, B:], self._now[:, B - 1 :]), axis=1)
+        self._emitted = np.concatenate((self._emitted, self._played), axis=1)[:, -self._window :]
+        for spectra, newest in (
+            (self._X, rfft(self._newest(self._references))),
+            (self._X_filtered, self._filtered_spectrum()),
+        ):
+            spectra[..., 1:, :] = spectra[..., :-1, :]
+            spectra[..., 0, :] = newest
+        self._follow()
+        if self._adapting:
+            self._adapt()
+        self._errors[:] = 0.0
+        self._n, self._adapting = 0, False
+        # The next block: its own samples are zero as yet.
+        heard = np.concatenate((self._references[:, -N:], np.zeros((self.n_references, B))), axis=1)
+        X = np.concatenate((rfft(heard)[:, None], self._X[:, self._every - 1 :: self._every]), axis=1)
+        self._earlier = self._block_of(np.sum(self._W * X[:, : self.n_partitions], axis=(1, 2)))
+        self._first_taps = np.ascontiguousarray(self._partitions(self._W[:, :, 0])[..., B - 1 :: -1])
+
+    # Samples.
+
+    def _emit(self, x: np.ndarray) -> np.ndarray:
+        """Return the control signals for samples (I, n) that lie within a block, (J, n)."""
+        if self._n == self.block_size:  # without an error of its last sample
+            self._end_block()
+        begin, end = self._n, self._n + x.shape[1]
+        self._now[:, self.block_size - 1 + begin : self.block_size - 1 + end] = x
+        y = self._earlier[:, begin:end].copy()
+        for j, filters in enumerate(self._first_taps):
+            for i, taps in enumerate(filters):
+                y[j] += np.correlate(self._now[i, begin : end + self.block_size - 1], taps, "valid")
+        self._played[:, begin:end] = y
+        self._n = end
+        return y
+
+    def emitted(self, control_signal: float) -> None:
+        """Take what a limiter made of the last control signal; `LimitedController` calls this."""
+        self._played[:, self._n - 1] = control_signal
+
+    def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
+        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last block.
+
+        With several channels, x(n) is (I,) and y(n) is (J,).
+        """
+        x = self._sample(reference, "reference", "references")
+        require_moderate(x, "reference")
+        y = self._emit(np.reshape(x, (-1, 1)))[:, 0]
+        return y if self.multichannel else float(y[0])
+
+    def update(self, error: NumberOrArray) -> None:
+        """Take the error e(n), with several channels (K,), that the last control signal left; adapt after B samples."""
+        e = self._sample(error, "error", "microphones")
+        require_moderate(e, "error")
+        if self._n == 0:
+            raise ValueError("update must follow the control_signal of its sample, but a new block has just begun")
+        self._errors[:, self._n - 1] = e
+        self._adapting = True
+        if self._n == self.block_size:
+            self._end_block()
+
+    def process(
+        self, references: ArrayLike, errors: ArrayLike, *, adapt: bool | ArrayLike = True, out: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
+        x = self._block_signal(references, "references", self.n_references)
+        e = self._block_signal(errors, "errors", self.n_microphones)
+        if calls_of(type(self)) != calls_of(BlockController) or max(np.abs(x).max(), np.abs(e).max()) > LOUDEST:
+            return super().process(x, e, adapt=adapt, out=out)  # as far as the sample that is refused
+        require_one_length(x, e)
+        flags = adapt_flags(adapt, x.shape[-1])
+        require_apart(out, x, e)
+        y = output_array(out, (self.n_loudspeakers, x.shape[1]) if self.multichannel else x.shape)
+        self._run(np.atleast_2d(x), np.atleast_2d(e), flags, np.atleast_2d(y))
+        return y
+
+    def _run(self, x: np.ndarray, e: np.ndarray, flags: np.ndarray, y: np.ndarray) -> None:
+        """Do what the two methods do for each sample, stretch by stretch of the blocks."""
+        begin, n_samples = 0, x.shape[1]
+        while begin < n_samples:
+            end = min(begin + self.block_size - self._n % self.block_size, n_samples)
+            part = slice(begin, end)
+            y[:, part] = self._emit(x[:, part])
+            self._errors[:, self._n - (end - begin) : self._n] = np.where(flags[part], e[:, part], 0.0)
+            self._adapting |= bool(flags[part].any())
+            if self._n == self.block_size and flags[end - 1]:
+                self._end_block()
+            begin = end
+
+    def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
+        """Follow the noise before the control is switched on, while the loudspeakers are silent; the weights stay.
+
+        Parameters
+        ----------
+        references : ndarray, shape (n_samples,) or (I, n_samples)
+            References.
+        errors : ndarray, shape (n_samples,) or (K, n_samples)
+            Signals of the error microphones.
+        """
+        self.process(references, errors, adapt=False)
+        self._played[:] = self._emitted[:] = 0.0
+
+    def require_sample_rate(self, fs: float) -> None:
+        """Raise ValueError if the secondary path is for another sample rate than `fs` in Hz."""
+        require_rates(fs, {"secondary path": self._path_fs})
+
+    def __repr__(self) -> str:
+        parts = f"{self.n_partitions} partition{'s' if self.n_partitions > 1 else ''} of {self.partition_size}"
+        return f"<{self.name}: {self.n_taps} taps in {parts}, blocks of {self.block_size} samples>"

@@ -1,0 +1,148 @@
+"""FxLMS in the frequency domain, by overlap-save."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .._types import PathModels
+from .._validate import as_positive
+from .base import as_forgetting
+from .block import BlockController
+
+RIDGE = 0.01  # of the mean power of all bins, added to that of each: the noise may leave bins empty
+
+
+class FrequencyDomainFxLMS(BlockController):
+    r"""FxLMS that adapts once per block of B samples, by Fourier transforms: cheap with many taps.
+
+    With :math:`X'_p` the spectrum of the filtered reference that partition p of the control filter sees, and E that of the
+    block's errors after zeros,
+
+    .. math:: W_p \leftarrow W_p + \mu\, C\Big\{\frac{1}{\Lambda}\, C\{X_p'^* E\}\Big\}, \qquad
+       \Lambda = \sum_p |X'_p|^2
+
+    C is the gradient constraint: back to time, the taps beyond the partition set to zero. Without the division this is
+    exactly the block LMS, :math:`w \leftarrow w + \mu \sum_n e(n) x'(n)`. With it, all bins converge at about the same
+    rate, whatever the colour of the noise. The inner C keeps the solution where it is: without it, a step that depends
+    on the frequency would also weigh what no causal filter can cancel.
+
+    Parameters
+    ----------
+    n_taps, secondary_path, n_references
+        As for `FxLMS`.
+    step_size : float
+        Step size mu, above zero; with the division by the power in each bin, below 1.
+    block_size : int
+        Samples B of a block. The weights follow a change no sooner than its end.
+    partition_size : int, optional
+        Taps N of a partition, a multiple of B; by default B. ``partition_size=n_taps`` makes one partition. The result is
+        the same for all N if the step is not divided.
+    constrained : bool, default True
+        False leaves out C except in the first partition, which the control signal without delay needs. This saves most
+        of the transforms, and settles only near the best filter: each partition also has taps that repeat those of its
+        neighbours. `weights` leaves these out.
+    forgetting : float or None, default 0.9
+        Forgetting factor, per block, of the powers :math:`\Lambda`; None: the step is not divided.
+
+    Attributes
+    ----------
+    n_partitions : int
+        Number of partitions P.
+
+    Raises
+    ------
+    ValueError
+        A step size that is not positive and finite; sizes below 1; a partition size that is not a multiple of the block
+        size; without the constraint, `n_taps` that is not a multiple of the partition size; a path that is not FIR.
+
+    Notes
+    -----
+    The control signal has no delay, see `BlockController`. A sample takes ``4 P`` transforms of ``N + B`` samples over B
+    with the constraint, and 10 without, and B multiplications. For a limiter, wrap it in a `LimitedController`.
+    Signals above 1e20 are refused.
+
+    References
+    ----------
+    J. J. Shynk, "Frequency-domain and multirate adaptive filtering", IEEE Signal Processing Magazine 9(1), 1992. F. Yang,
+    Y. Cao, M. Wu, F. Albu, J. Yang, "Frequency-domain filtered-x LMS algorithms for active noise control: a review and new
+    insights", Applied Sciences 8(11), 2018. The bias of a step that depends on the frequency: S. J. Elliott, B. Rafaely,
+    "Frequency-domain adaptation of causal digital filters", IEEE Trans. Signal Processing 48(5), 2000; they remove it by
+    spectral factors of the step, not by a second constraint.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import FrequencyDomainFxLMS, noise_reduction_db, simulate
+    >>> x = np.random.default_rng(0).standard_normal(16000)
+    >>> controller = FrequencyDomainFxLMS(64, [0.0, 1.0], step_size=0.2, block_size=32)
+    >>> result = simulate(controller, x, primary_path=[0.0, 0.0, 0.8, 0.4], secondary_path=[0.0, 1.0])
+    >>> bool(noise_reduction_db(result.error, result.disturbance) > 60)
+    True
+    >>> controller.weights[:3].round(6)
+    array([0. , 0.8, 0.4])
+    """
+
+    name = "frequency-domain FxLMS"
+
+    def __init__(
+        self,
+        n_taps: int,
+        secondary_path: PathModels,
+        *,
+        step_size: float,
+        block_size: int,
+        partition_size: int | None = None,
+        constrained: bool = True,
+        forgetting: float | None = 0.9,
+        n_references: int = 1,
+    ) -> None:
+        self.step_size = as_positive(step_size, "step_size")
+        self.forgetting = None if forgetting is None else as_forgetting(forgetting)
+        self.constrained = constrained
+        super().__init__(
+            n_taps,
+            secondary_path,
+            block_size=block_size,
+            partition_size=partition_size,
+            n_references=n_references,
+        )
+        if not constrained and self.n_taps % self.partition_size:
+            raise ValueError(
+                f"n_taps must be a multiple of partition_size = {self.partition_size} without the constraint, "
+                f"got {self.n_taps}"
+            )
+        self._powers, self._blocks = np.zeros(self._W.shape[-1]), 0  # of a partition's filtered references
+
+    def _follow(self) -> None:
+        self._blocks += 1
+        self._powers = self._averaged(self._powers, np.sum(np.abs(self._X_filtered[..., 0, :]) ** 2, axis=(0, 1, 2)))
+
+    def _averaged(self, mean: np.ndarray, newest: np.ndarray) -> np.ndarray:
+        """Return a mean over blocks with the newest one."""
+        share = max(1.0 - (self.forgetting or 0.0), 1.0 / self._blocks)
+        return mean + share * (newest - mean)
+
+    def _adapt(self) -> None:
+        self._descend(self._gradient(), self._powers)
+
+    def _gradient(self) -> np.ndarray:
+        """Return X'* E, summed over microphones, (J, I, P, bins): minus half the gradient of the squared errors."""
+        E = self._block_spectrum(self._errors)[:, None, None, None]
+        return np.sum(self._X_filtered[..., :: self._every, :].conj() * E, axis=0)
+
+    def _descend(self, gradient: np.ndarray, powers: np.ndarray) -> None:
+        """Take a step; `powers` are those of a partition in each bin, (bins,) or (J, 1, 1, bins)."""
+        self._constrain(gradient)
+        if self.forgetting is not None:
+            ridge = RIDGE * np.mean(powers, axis=-1, keepdims=True) + np.finfo(float).tiny
+            gradient /= self.n_partitions * (powers + ridge)
+            self._constrain(gradient)
+        self._W += self.step_size * gradient
+
+    def _constrain(self, gradient: np.ndarray) -> None:
+        """Set the taps beyond the partitions to zero."""
+        chosen = gradient if self.constrained else gradient[:, :, :1]
+        taps = self._partitions(chosen)
+        if self.constrained:
+            taps[:, :, -1, self.n_taps - (self.n_partitions - 1) * self.partition_size :] = 0.0
+        chosen[:] = self._spectra(taps)
