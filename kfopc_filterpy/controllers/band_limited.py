@@ -24,8 +24,8 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
     without limits. With the spectrum Y of the block's control signal, the powers :math:`p_b` in the bands, their limits
     :math:`\rho_b` and the gain :math:`G_b = E|X'|^2 / E|X|^2` in a band,
 
-    .. math:: W \leftarrow W + \mu\, C\Big\{\frac{1}{\Lambda}\, C\{X'^* E - \lambda X^* Y\}\Big\}, \qquad
-       \Lambda = \sum_p |X'_p|^2 + \lambda |X_p|^2
+    .. math:: W \leftarrow W + \mu\, C\big\{M\, C\{M^* (X'^* E - \lambda X^* Y)\}\big\}, \qquad
+       |M|^{-2} = \sum_p |X'_p|^2 + \lambda |X_p|^2
 
     .. math:: \lambda_b \leftarrow \max\Big\{\lambda_b + \frac{\mu}{16}\, G_b \Big(\frac{p_b}{\rho_b} - 1\Big),\ 0\Big\}
 
@@ -177,7 +177,7 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
         prices = (self._prices @ self._bands)[:, None, None]
         Y = self._block_spectrum(self._played)[:, None, None]
         gradient = self._gradient() - prices * self._X[:, :: self._every].conj() * Y
-        self._descend(gradient, self._powers + prices * self._reference_powers)
+        self._descend(gradient, self._divisor(self._powers + prices * self._reference_powers))
 
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError if the bands or the secondary path are for another sample rate than `fs` in Hz."""
@@ -188,7 +188,11 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
 def _bins_of_bands(edges: Any, fs: float, samples: int) -> np.ndarray:
     """Return the share of each bin of a transform that lies in each band, (n_bands, bins)."""
     values, spacing = as_real_array(edges, "band_edges"), fs / samples
-    if values.ndim != 1 or values.size < 2 or not (values[0] >= 0 and values[-1] <= fs / 2 and np.all(np.diff(values) > 0)):
+    if (
+        values.ndim != 1
+        or values.size < 2
+        or not (values[0] >= 0 and values[-1] <= fs / 2 and np.all(np.diff(values) > 0))
+    ):
         raise ValueError(f"band_edges must rise from 0 or above to fs/2 = {fs / 2:g} Hz at most, got {edges!r}")
     if np.diff(values).min() < spacing:
         raise ValueError(

@@ -71,11 +71,11 @@ def differing_counts(controller: Any, **counts: int) -> Iterator[tuple[str, int]
             yield name, own
 
 
-def as_forgetting(value: Any) -> float:
+def as_forgetting(value: Any, name: str = "forgetting") -> float:
     """Return a forgetting factor, checked."""
-    forgetting = as_positive(value, "forgetting")
+    forgetting = as_positive(value, name)
     if forgetting > 1.0:
-        raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
+        raise ValueError(f"{name} must be 1 at most, got {forgetting:g}: 1 forgets nothing")
     return forgetting
 
 

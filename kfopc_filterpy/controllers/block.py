@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import irfft, next_fast_len, rfft
@@ -49,7 +47,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         *,
         block_size: int,
         partition_size: int | None,
-        n_references: int,
+        n_references: int | None,
     ) -> None:
         self.n_taps = as_count(n_taps, "n_taps")
         path = self._read_paths(secondary_path, n_references, None)
@@ -69,7 +67,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         self._emitted = np.zeros((J, self._window))
         self._now = np.zeros((I, 2 * B - 1))  # the references of this block, after zeros
         self._played, self._errors = np.zeros((J, B)), np.zeros((K, B))  # control signals and errors of this block
-        self._n, self._adapting = 0, False  # samples of this block; whether an error of it was taken
+        self._n, self._taken = 0, np.zeros(B, dtype=bool)  # samples of this block; whose errors were taken
         # Spectra of N + B samples, the newest block first.
         self._X = np.zeros((I, spectra, bins), dtype=complex)
         self._X_filtered = np.zeros((K, J, I, spectra, bins), dtype=complex)
@@ -153,10 +151,9 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
             spectra[..., 1:, :] = spectra[..., :-1, :]
             spectra[..., 0, :] = newest
         self._follow()
-        if self._adapting:
+        if self._taken.any():
             self._adapt()
-        self._errors[:] = 0.0
-        self._n, self._adapting = 0, False
+        self._errors[:], self._taken[:], self._n = 0.0, False, 0
         # The next block: its own samples are zero as yet.
         heard = np.concatenate((self._references[:, -N:], np.zeros((self.n_references, B))), axis=1)
         X = np.concatenate((rfft(heard)[:, None], self._X[:, self._every - 1 :: self._every]), axis=1)
@@ -199,8 +196,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         require_moderate(e, "error")
         if self._n == 0:
             raise ValueError("update must follow the control_signal of its sample, but a new block has just begun")
-        self._errors[:, self._n - 1] = e
-        self._adapting = True
+        self._errors[:, self._n - 1], self._taken[self._n - 1] = e, True
         if self._n == self.block_size:
             self._end_block()
 
@@ -226,8 +222,8 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
             end = min(begin + self.block_size - self._n % self.block_size, n_samples)
             part = slice(begin, end)
             y[:, part] = self._emit(x[:, part])
-            self._errors[:, self._n - (end - begin) : self._n] = np.where(flags[part], e[:, part], 0.0)
-            self._adapting |= bool(flags[part].any())
+            here = slice(self._n - (end - begin), self._n)
+            self._errors[:, here], self._taken[here] = np.where(flags[part], e[:, part], 0.0), flags[part]
             if self._n == self.block_size and flags[end - 1]:
                 self._end_block()
             begin = end

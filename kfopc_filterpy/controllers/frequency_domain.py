@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.fft import irfft, rfft
 
 from .._types import PathModels
 from .._validate import as_positive
@@ -18,31 +19,32 @@ class FrequencyDomainFxLMS(BlockController):
     With :math:`X'_p` the spectrum of the filtered reference that partition p of the control filter sees, and E that of the
     block's errors after zeros,
 
-    .. math:: W_p \leftarrow W_p + \mu\, C\Big\{\frac{1}{\Lambda}\, C\{X_p'^* E\}\Big\}, \qquad
-       \Lambda = \sum_p |X'_p|^2
+    .. math:: W_p \leftarrow W_p + \mu\, C\big\{M\, C\{M^* X_p'^* E\}\big\}, \qquad
+       |M|^2 = \frac{1}{\Lambda}, \qquad \Lambda = \sum_p |X'_p|^2
 
-    C is the gradient constraint: back to time, the taps beyond the partition set to zero. Without the division this is
-    exactly the block LMS, :math:`w \leftarrow w + \mu \sum_n e(n) x'(n)`. With it, all bins converge at about the same
-    rate, whatever the colour of the noise. The inner C keeps the solution where it is: without it, a step that depends
-    on the frequency would also weigh what no causal filter can cancel.
+    C is the gradient constraint: back to time, the taps beyond the partition set to zero. M is causal, the minimum-phase
+    factor of the step. With it, all bins converge at about the same rate, whatever the colour of the noise, and the
+    weights settle at the best causal filter; a step :math:`1/\Lambda` in one piece would also weigh what no causal filter
+    can cancel. Without M this is exactly the block LMS, :math:`w \leftarrow w + \mu \sum_n e(n)\, x'(n)`.
 
     Parameters
     ----------
     n_taps, secondary_path, n_references
         As for `FxLMS`.
     step_size : float
-        Step size mu, above zero; with the division by the power in each bin, below 1.
+        Step size mu, above zero; below 1 unless `forgetting` is None.
     block_size : int
         Samples B of a block. The weights follow a change no sooner than its end.
     partition_size : int, optional
-        Taps N of a partition, a multiple of B; by default B. ``partition_size=n_taps`` makes one partition. The result is
-        the same for all N if the step is not divided.
+        Taps N of a partition, a multiple of B; by default B. One partition has at least `n_taps`. For the block LMS, the
+        result does not depend on it.
     constrained : bool, default True
         False leaves out C except in the first partition, which the control signal without delay needs. This saves most
-        of the transforms, and settles only near the best filter: each partition also has taps that repeat those of its
-        neighbours. `weights` leaves these out.
+        of the transforms. But each partition then also has taps that repeat those of its neighbours (`weights` leaves
+        them out) and vary within a block, so the secondary path must be much shorter than a block, and the weights settle
+        only near the best filter.
     forgetting : float or None, default 0.9
-        Forgetting factor, per block, of the powers :math:`\Lambda`; None: the step is not divided.
+        Forgetting factor, per block, of the powers :math:`\Lambda`; None: the block LMS, without M.
 
     Attributes
     ----------
@@ -57,17 +59,16 @@ class FrequencyDomainFxLMS(BlockController):
 
     Notes
     -----
-    The control signal has no delay, see `BlockController`. A sample takes ``4 P`` transforms of ``N + B`` samples over B
-    with the constraint, and 10 without, and B multiplications. For a limiter, wrap it in a `LimitedController`.
-    Signals above 1e20 are refused.
+    The control signal has no delay, see `BlockController`. A block takes some ``4 P`` transforms of ``N + B`` samples with
+    the constraint, and a fixed number without; a sample takes B multiplications. For a limiter, wrap it in a
+    `LimitedController`. Samples above 1e20 are refused.
 
     References
     ----------
     J. J. Shynk, "Frequency-domain and multirate adaptive filtering", IEEE Signal Processing Magazine 9(1), 1992. F. Yang,
     Y. Cao, M. Wu, F. Albu, J. Yang, "Frequency-domain filtered-x LMS algorithms for active noise control: a review and new
-    insights", Applied Sciences 8(11), 2018. The bias of a step that depends on the frequency: S. J. Elliott, B. Rafaely,
-    "Frequency-domain adaptation of causal digital filters", IEEE Trans. Signal Processing 48(5), 2000; they remove it by
-    spectral factors of the step, not by a second constraint.
+    insights", Applied Sciences 8(11), 2018. The spectral factors of the step: S. J. Elliott, B. Rafaely, "Frequency-domain
+    adaptation of causal digital filters", IEEE Trans. Signal Processing 48(5), 2000.
 
     Examples
     --------
@@ -94,7 +95,7 @@ class FrequencyDomainFxLMS(BlockController):
         partition_size: int | None = None,
         constrained: bool = True,
         forgetting: float | None = 0.9,
-        n_references: int = 1,
+        n_references: int | None = 1,
     ) -> None:
         self.step_size = as_positive(step_size, "step_size")
         self.forgetting = None if forgetting is None else as_forgetting(forgetting)
@@ -123,20 +124,26 @@ class FrequencyDomainFxLMS(BlockController):
         return mean + share * (newest - mean)
 
     def _adapt(self) -> None:
-        self._descend(self._gradient(), self._powers)
+        self._descend(self._gradient(), self._divisor(self._powers))
+
+    def _divisor(self, powers: np.ndarray) -> np.ndarray:
+        """Return Lambda by the powers that a partition sees in each bin, (..., bins)."""
+        ridge = RIDGE * np.mean(powers, axis=-1, keepdims=True) + np.finfo(float).tiny
+        return self.n_partitions * (powers + ridge)
 
     def _gradient(self) -> np.ndarray:
         """Return X'* E, summed over microphones, (J, I, P, bins): minus half the gradient of the squared errors."""
         E = self._block_spectrum(self._errors)[:, None, None, None]
         return np.sum(self._X_filtered[..., :: self._every, :].conj() * E, axis=0)
 
-    def _descend(self, gradient: np.ndarray, powers: np.ndarray) -> None:
-        """Take a step; `powers` are those of a partition in each bin, (bins,) or (J, 1, 1, bins)."""
-        self._constrain(gradient)
+    def _descend(self, gradient: np.ndarray, divisor: np.ndarray) -> None:
+        """Take a step along a gradient (J, I, P, bins), divided in each bin."""
         if self.forgetting is not None:
-            ridge = RIDGE * np.mean(powers, axis=-1, keepdims=True) + np.finfo(float).tiny
-            gradient /= self.n_partitions * (powers + ridge)
+            factor = minimum_phase(divisor**-0.5)
+            gradient *= factor.conj()
             self._constrain(gradient)
+            gradient *= factor
+        self._constrain(gradient)
         self._W += self.step_size * gradient
 
     def _constrain(self, gradient: np.ndarray) -> None:
@@ -146,3 +153,12 @@ class FrequencyDomainFxLMS(BlockController):
         if self.constrained:
             taps[:, :, -1, self.n_taps - (self.n_partitions - 1) * self.partition_size :] = 0.0
         chosen[:] = self._spectra(taps)
+
+
+def minimum_phase(magnitude: np.ndarray) -> np.ndarray:
+    """Return the spectrum (..., bins) of the causal filter with this magnitude and the least delay, by its cepstrum."""
+    cepstrum = irfft(np.log(magnitude))
+    half = cepstrum.shape[-1] // 2
+    cepstrum[..., 1:half] *= 2.0
+    cepstrum[..., half + 1 :] = 0.0
+    return np.exp(rfft(cepstrum))
