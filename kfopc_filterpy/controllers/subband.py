@@ -48,7 +48,7 @@ class SubbandFxLMS(BlockController):
     The prototype of the bank is a low-pass filter of 4 M taps. The errors are heard through the bank, which delays the
     adaptation by 2 M samples; this limits the step size. A filter in a band is as long as the control filter, but a
     response between two bands, or a delay that is no multiple of M/2, needs taps beyond it. So the weights settle near
-    the best filter, not at it. For a limiter, wrap it in a `LimitedController`.
+    the best filter, not at it. Of a new `secondary_path`, it knows nothing but that after L + 4 M samples. For a limiter, wrap it in a `LimitedController`.
 
     References
     ----------

@@ -12,9 +12,12 @@ from helpers.channels import random_paths
 from helpers.loop import AMPLIFIERS, FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R
 from kfopc_filterpy import (
     KFOPC,
+    BandLimitedFxLMS,
     ClippingFxLMS,
     DiagonalKalman,
     FastArrayKalman,
+    FrequencyDomainFxLMS,
+    FrequencyDomainKalman,
     FxLMS,
     FxNLMS,
     HardClipAmplifier,
@@ -26,6 +29,7 @@ from kfopc_filterpy import (
     OutputLimiter,
     OutputPowerConstraint,
     RescalingFxLMS,
+    SubbandFxLMS,
     TwoGradientFxLMS,
     fx_rls,
     kf_anc,
@@ -131,6 +135,28 @@ SEVERAL: dict[str, Any] = {
     "TwoGradientFxLMS": lambda: TwoGradientFxLMS(L, PATHS, step_size=MU, amplitude_limit=0.5, **MANY),
     "RescalingFxLMS": lambda: RescalingFxLMS(L, PATHS, step_size=MU, amplitude_limit=[0.1, 0.5], **MANY),
     "ClippingFxLMS": lambda: ClippingFxLMS(L, PATHS, step_size=MU, amplitude_limit=0.5, **MANY),
+}
+
+# Controllers that adapt once per block. Runs of 300 samples end within one.
+
+IN_BLOCKS: dict[str, Any] = {
+    "frequency domain": lambda: FrequencyDomainFxLMS(N_TAPS, S_HAT, step_size=0.2, block_size=7),
+    "block LMS": lambda: FrequencyDomainFxLMS(N_TAPS, S_HAT, step_size=MU, block_size=14, forgetting=None),
+    "unconstrained": lambda: FrequencyDomainFxLMS(
+        56, S_HAT, step_size=0.1, block_size=7, partition_size=28, constrained=False
+    ),
+    "frequency domain, many": lambda: FrequencyDomainFxLMS(
+        L, PATHS, step_size=0.1, block_size=7, partition_size=14, **MANY
+    ),
+    "band-limited": lambda: BandLimitedFxLMS(
+        24, S_HAT, step_size=0.2, block_size=7, band_edges=[0, FS / 4, FS / 2], band_powers=[0.1, 0.2], fs=FS
+    ),
+    "band-limited, many": lambda: BandLimitedFxLMS(
+        L, PATHS, step_size=0.1, block_size=7, band_edges=[0, FS / 2], band_powers=[[0.02], [0.05]], fs=FS, **MANY
+    ),
+    "subband": lambda: SubbandFxLMS(16, S_HAT, step_size=0.2, n_bands=4, block_size=14),
+    "subband, many": lambda: SubbandFxLMS(8, PATHS, step_size=0.1, n_bands=4, block_size=14, **MANY),
+    "frequency-domain Kalman": lambda: FrequencyDomainKalman(N_TAPS, S_HAT, block_size=7, partition_size=7),
 }
 
 # Controllers around something: around another controller, or a filter of somebody else.
@@ -243,7 +269,7 @@ AROUND: dict[str, Any] = {
 OWN = (OwnFilter, OwnController, own_amplifier)  # what loading them needs beyond the package
 
 ALL: dict[str, Any] = {f"{name} {variant}": lambda n=name, v=variant: made(n, v) for name, variant in VARIANTS}
-ALL |= {f"{name} many": make for name, make in SEVERAL.items()} | AROUND
+ALL |= {f"{name} many": make for name, make in SEVERAL.items()} | IN_BLOCKS | AROUND
 
 FILTERS: dict[str, Any] = {
     "KFOPC": lambda: _full(rated_power=0.3),
