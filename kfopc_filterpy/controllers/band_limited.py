@@ -11,6 +11,7 @@ from scipy.fft import rfft
 from .._types import NumberOrArray, PathModels
 from .._validate import as_positive, as_rate, as_real_array, per_loudspeaker
 from .base import require_rates
+from .block import TINY
 from .frequency_domain import FrequencyDomainFxLMS
 
 PRICE_RATE = 1 / 16  # of the step size: the prices settle without ringing, also with the averaged powers
@@ -171,7 +172,7 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
 
     def _adapt(self) -> None:
         powers, reference = self._bands @ self._powers, self._bands @ self._reference_powers
-        gain = powers / np.maximum(reference, np.finfo(float).tiny)
+        gain = powers / np.maximum(reference, TINY)
         excess = np.minimum(self._output_powers / self._limits - 1.0, MOST_EXCESS)
         self._prices = np.maximum(self._prices + PRICE_RATE * self.step_size * gain * excess, 0.0)
         prices = (self._prices @ self._bands)[:, None, None]

@@ -14,6 +14,9 @@ from .channel_samples import LOUDEST, require_moderate
 from .channels import Channels
 from .processing import BlockProcessing, adapt_flags, output_array, require_apart, require_one_length
 
+ROUNDING = 1e-12  # -120 dB; rounding errors are at -300 dB
+TINY = float(np.finfo(float).tiny)
+
 
 class BlockController(Channels, BlockProcessing, Checkpointed):
     r"""Base class of the block controllers: the control filter stays as it is for B samples, then `_adapt` changes it.
@@ -104,6 +107,10 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         end = self._references.shape[1] - back * self.block_size
         x = rfft(self._references[:, end - self._window : end])
         return rfft(self._newest(irfft(x * self._S, self._window)))
+
+    def _least_power(self) -> float:
+        """Return a power far below that of the filtered references: a path that is still silent leaves rounding errors."""
+        return ROUNDING * float(np.sum(self._path**2) * np.mean(self._newest(self._references) ** 2)) + TINY
 
     def _newest(self, signal: np.ndarray) -> np.ndarray:
         """Return the newest N + B samples."""

@@ -128,8 +128,8 @@ class FrequencyDomainFxLMS(BlockController):
 
     def _divisor(self, powers: np.ndarray) -> np.ndarray:
         """Return Lambda by the powers that a partition sees in each bin, (..., bins)."""
-        ridge = RIDGE * np.mean(powers, axis=-1, keepdims=True) + np.finfo(float).tiny
-        return self.n_partitions * (powers + ridge)
+        least = (self.partition_size + self.block_size) * self._least_power()
+        return self.n_partitions * (powers + RIDGE * np.mean(powers, axis=-1, keepdims=True) + least)
 
     def _gradient(self) -> np.ndarray:
         """Return X'* E, summed over microphones, (J, I, P, bins): minus half the gradient of the squared errors."""

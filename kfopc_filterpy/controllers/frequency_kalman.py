@@ -8,6 +8,7 @@ from scipy.fft import irfft, rfft
 from .._types import PathModel
 from .._validate import as_positive
 from .base import as_forgetting
+from .block import TINY
 from .frequency_domain import FrequencyDomainFxLMS
 
 
@@ -101,6 +102,6 @@ class FrequencyDomainKalman(FrequencyDomainFxLMS):
         P *= self.transition**2
         P += (1.0 - self.transition**2) * np.abs(W) ** 2
         share, powers = self.block_size / (self.block_size + self.partition_size), np.abs(X) ** 2
-        step = P / (share * np.sum(powers * P, axis=0) + self._noise + np.finfo(float).tiny)
+        step = P / (share * np.sum(powers * P, axis=0) + self._noise + TINY)
         self._descend((X.conj() * E)[None, None], 1.0 / step)
         P *= 1.0 - share * step * powers

@@ -115,11 +115,11 @@ class SubbandFxLMS(BlockController):
         self._x_bands = np.concatenate((self._x_bands[..., self._steps :, :], newest), axis=-2)
 
     def _adapt(self) -> None:
-        errors, taps = self._analysed(self._e_line), self._w_bands.shape[-2]
+        errors, taps, least = self._analysed(self._e_line), self._w_bands.shape[-2], self.n_taps * self._least_power()
         for m in range(self._steps):
             x = self._x_bands[..., m : m + taps, :]
             energy = np.sum(x.real**2 + x.imag**2, axis=(0, 1, 2, 3))
-            step = self.step_size / self._steps / (energy + RIDGE * energy.mean() + np.finfo(float).tiny)
+            step = self.step_size / self._steps / (energy + RIDGE * energy.mean() + least)
             self._w_bands += np.sum(x.conj() * (step * errors[:, m])[:, None, None, None], axis=0)
         # The newest sample's tap first, as in the control filter.
         spectra = fft(self._w_bands[..., ::-1, :], axis=-2)[..., *self._stacked]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -26,9 +27,9 @@ from kfopc_filterpy import (
 )
 from kfopc_filterpy.bounds import wiener_solution
 
-FS, SWITCH_ON_S = 16000.0, 1.0
-SECONDARY = np.array([0.0, 0.0, 0.8, 0.3, -0.2, 0.1])
-PRIMARY = np.concatenate((np.zeros(6), 0.9 ** np.arange(60.0) * np.cos(np.arange(60.0))))
+FS, DELAY = 16000.0, 32
+SECONDARY = np.concatenate((np.zeros(DELAY), [0.8, 0.3, -0.2, 0.1]))
+PRIMARY = np.concatenate((np.zeros(36), 0.9 ** np.arange(60.0) * np.cos(np.arange(60.0))))
 
 
 class BlockLMS(lms.FxLMS):
@@ -51,7 +52,7 @@ class BlockLMS(lms.FxLMS):
 @given(
     channels=st.sampled_from([(1, 1, 1), (3, 2, 2)]),
     sizes=st.tuples(st.integers(1, 40), st.integers(1, 20), st.integers(1, 6)),
-    path_taps=st.integers(1, 12),
+    path_taps=st.integers(3, 12),
 )
 def test_without_division_it_is_the_block_lms_in_any_partition(
     channels: tuple[int, int, int], sizes: tuple[int, int, int], path_taps: int
@@ -85,8 +86,19 @@ def coloured(seconds: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return x, lfilter(PRIMARY, [1.0], x) + 0.02 * rng.standard_normal(x.size)
 
 
+def closed_loop(controller: Any, x: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return control signal and error over the second half, run in blocks as short as the secondary path's delay."""
+    line, e = np.zeros(SECONDARY.size - 1 + x.size), np.zeros(x.size)  # the control signal after zeros
+    y = line[SECONDARY.size - 1 :]
+    for a in range(0, x.size, DELAY):
+        b = a + DELAY
+        e[a:b] = d[a:b] - np.convolve(line[a : b + SECONDARY.size - 1], SECONDARY, "valid")
+        y[a:b] = controller.process(x[a:b], e[a:b])
+    return y[x.size // 2 :], e[x.size // 2 :]
+
+
 def near_wiener(**settings: Any) -> Any:
-    return FrequencyDomainFxLMS(128, SECONDARY, step_size=0.3, block_size=32, **settings)
+    return FrequencyDomainFxLMS(128, SECONDARY, step_size=0.1, block_size=32, **settings)
 
 
 @pytest.mark.parametrize(
@@ -95,17 +107,16 @@ def near_wiener(**settings: Any) -> Any:
         pytest.param(near_wiener(), 0.3, id="partitions"),
         pytest.param(near_wiener(partition_size=128), 0.3, id="one partition"),
         pytest.param(near_wiener(constrained=False), 3.0, id="unconstrained"),
-        pytest.param(FrequencyDomainKalman(128, SECONDARY, block_size=32), 1.0, id="Kalman"),
-        pytest.param(SubbandFxLMS(128, SECONDARY, step_size=0.5, n_bands=16, block_size=32), 3.0, id="subband"),
+        pytest.param(FrequencyDomainKalman(128, SECONDARY, block_size=32), 1.5, id="Kalman"),
+        pytest.param(SubbandFxLMS(128, SECONDARY, step_size=0.15, n_bands=16, block_size=32), 3.0, id="subband"),
     ],
 )
 def test_it_settles_near_the_best_filter(controller: Any, loss_db: float) -> None:
-    """In 3 s, on a colour that the LMS of one step size needs minutes for."""
-    x, d = coloured(4.0)
+    """In 4 s, on a colour that the LMS of one step size needs minutes for."""
+    x, d = coloured(8.0)
+    _, e = closed_loop(controller, x, d)
     best = wiener_solution(x, d, SECONDARY, n_taps=128).noise_reduction_db
-    result = simulate(controller, x, disturbance=d, secondary_path=SECONDARY)
-    end = slice(int(3 * FS), None)
-    assert best - loss_db < noise_reduction_db(result.error[end], result.disturbance[end]) < best + 0.5
+    assert abs(best - loss_db / 2 - noise_reduction_db(e, d[-e.size :])) < loss_db / 2 + 0.1
 
 
 def band_power(y: np.ndarray, low: float, high: float) -> float:
@@ -116,44 +127,46 @@ def band_power(y: np.ndarray, low: float, high: float) -> float:
 
 
 def test_each_band_keeps_its_limit_and_the_others_are_left_alone() -> None:
-    x, d = coloured(6.0)
+    x, d = coloured(12.0)
     edges = [0.0, 900.0, 1800.0, 4000.0, 8000.0]
-    settings: dict[str, Any] = {
-        "step_size": 0.2,
-        "block_size": 64,
-        "partition_size": 128,
-        "band_edges": edges,
-        "fs": FS,
-    }
 
     def powers(limits: Any) -> np.ndarray:
-        controller = BandLimitedFxLMS(128, SECONDARY, band_powers=limits, **settings)
-        y = simulate(controller, x, disturbance=d, secondary_path=SECONDARY).control_signal[int(2 * FS) :]
+        controller = BandLimitedFxLMS(
+            128,
+            SECONDARY,
+            step_size=0.2,
+            block_size=64,
+            partition_size=128,
+            band_edges=edges,
+            band_powers=limits,
+            fs=FS,
+        )
         assert controller.rated_power == pytest.approx(np.sum(limits))
-        return np.array([band_power(y, *band) for band in zip(edges[:-1], edges[1:], strict=True)])
+        y, _ = closed_loop(controller, x, d)
+        return np.array([band_power(y, *band) for band in itertools.pairwise(edges)])
 
     free = powers([1e3] * 4)
     limits = free * [10.0, 0.25, 10.0, 0.25]
-    ratios = powers(limits) / limits
-    assert np.all(ratios[[1, 3]] < 1.02) and np.all(ratios[[1, 3]] > 0.9)
-    assert np.all(ratios[[0, 2]] > 0.08)  # 0.1 if nothing were lost beside the edges
+    used = powers(limits) / limits
+    assert np.all(used[[1, 3]] < 1.02)
+    assert np.all(used[[1, 3]] > 0.93)  # an edge is two bins wide, and at 4 kHz the spectrum falls by 20 % in these
+    assert np.all(used[[0, 2]] > 0.06)  # 0.1 if the edges of a filter of 128 taps were sharp
 
 
 def test_one_band_is_the_bound_of_the_total_power() -> None:
     """Within 0.1 dB, and not behind KF-PB by more than that."""
-    x, d = coloured(6.0)
+    x, d = coloured(12.0)
     bound = power_constrained_wiener(
-        x, disturbance=d, secondary_path=SECONDARY, n_taps=128, rated_power=0.5, fs=FS, switch_on_s=3.0
+        x, disturbance=d, secondary_path=SECONDARY, n_taps=128, rated_power=0.5, fs=FS, switch_on_s=6.0
     )
     limited = BandLimitedFxLMS(
         128, SECONDARY, step_size=0.1, block_size=64, band_edges=[0, FS / 2], band_powers=[0.5], fs=FS
     )
     reductions = []
     for controller in (limited, kf_pb(128, SECONDARY, rated_power=0.5, fs=FS)):
-        result = simulate(controller, x, disturbance=d, secondary_path=SECONDARY, fs=FS)
-        end = slice(int(3 * FS), None)
-        assert np.mean(result.control_signal[end] ** 2) < 1.02 * 0.5
-        reductions.append(noise_reduction_db(result.error[end], result.disturbance[end]))
+        y, e = closed_loop(controller, x, d)
+        assert np.mean(y**2) < 1.02 * 0.5
+        reductions.append(noise_reduction_db(e, d[-e.size :]))
     assert reductions[0] > max(bound.whole.noise_reduction_db, reductions[1]) - 0.1
     limited.rated_power = 0.25
     assert limited.band_powers == pytest.approx([0.25])
@@ -161,13 +174,13 @@ def test_one_band_is_the_bound_of_the_total_power() -> None:
 
 def test_the_kalman_filter_learns_from_what_a_limiter_lets_through() -> None:
     """Its estimate of the disturbance needs the limited signal; with the other one it would learn something else."""
-    x, d = coloured(4.0)
+    x, d = coloured(1.5)
     controller = FrequencyDomainKalman(64, SECONDARY, block_size=32)
     limited = LimitedController(controller, OutputLimiter(0.2, fs=FS))
-    result = simulate(limited, x, disturbance=d, secondary_path=SECONDARY, fs=FS)
-    assert np.mean(result.control_signal**2) < 0.2
+    y, _ = closed_loop(limited, x, d)
+    assert np.mean(y**2) < 0.21
     learned = lfilter(SECONDARY, [1.0], lfilter(controller.weights, [1.0], x))
-    assert noise_reduction_db((d - learned)[-int(FS) :], d[-int(FS) :]) > 15
+    assert noise_reduction_db((d - learned)[-y.size :], d[-y.size :]) > 15
 
 
 BANDS: dict[str, Any] = {"band_edges": [0, 4000, 8000], "band_powers": [1.0, 1.0]}
