@@ -201,6 +201,31 @@ def block_table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def long_times() -> list[dict[str, Any]]:
+    """Return the times of a sample with many taps in µs: the best of some rounds, in turns."""
+    rows = []
+    for taps in variants.LONG_TAPS:
+        works = {name: variants.long_filter(name, taps) for name in variants.LONG}
+        best = dict.fromkeys(works, np.inf)
+        for _ in range(ROUNDS):
+            for name, (work, samples) in works.items():
+                best[name] = min(best[name], shortest(work) / samples * 1e6)
+        rows += [{"controller": name, "taps": taps, "us_per_sample": us} for name, us in best.items()]
+    return rows
+
+
+def long_table(rows: list[dict[str, Any]]) -> str:
+    """Return the times with many taps for the terminal, and their ratios to the first controller's."""
+    us = {(row["controller"], row["taps"]): row["us_per_sample"] for row in rows}
+    first, taps = rows[0]["controller"], list(dict.fromkeys(row["taps"] for row in rows))
+    title = f"{f'µs a sample, blocks of {variants.LONG_BLOCK}':38}{''.join(f'{n:>10}' for n in taps)}"
+    lines, ratios = [title], [f"times the time of {first}"]
+    for name in dict.fromkeys(row["controller"] for row in rows):
+        lines.append(f"{name:38}{''.join(f'{us[name, n]:10.3f}' for n in taps)}")
+        ratios.append(f"{name:38}{''.join(f'{us[name, n] / us[first, n]:10.2f}' for n in taps)}")
+    return "\n".join([*lines, "", *ratios])
+
+
 def real_time_taps(rows: list[dict[str, Any]], name: str, fs: float) -> int | None:
     """Return the most taps at which a sample of a variant is over before the next."""
     fits = [row["taps"] for row in rows if row["variant"] == name and row["us_per_sample"] < 1e6 / fs]
@@ -296,6 +321,7 @@ def main(folder: Path, quiet: bool = False) -> int:
         "beside_filterpy": times_beside_filterpy,
         "channels": channel_times,
         "blocks": block_times,
+        "long": long_times,
     }
     planned = len(TAPS) * ROUNDS + len(WORST_TAPS) + len(measures)
     with threadpool_limits(1), tqdm(total=planned, disable=quiet, unit="round") as bar:
@@ -321,6 +347,7 @@ def main(folder: Path, quiet: bool = False) -> int:
         channel_table(others["channels"]),
         table_beside_filterpy(others["beside_filterpy"]),
         block_table(others["blocks"]),
+        long_table(others["long"]),
         "\n".join(fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(result)),
         sep="\n\n",
     )

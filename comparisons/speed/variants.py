@@ -13,7 +13,19 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from kfopc_filterpy import KFOPC, FxLMS, MOVFxLMS, kf_anc, kf_opc, kf_pb, simulate, simulate_scenarios
+from kfopc_filterpy import (
+    KFOPC,
+    FrequencyDomainFxLMS,
+    FrequencyDomainKalman,
+    FxLMS,
+    MOVFxLMS,
+    SubbandFxLMS,
+    kf_anc,
+    kf_opc,
+    kf_pb,
+    simulate,
+    simulate_scenarios,
+)
 from kfopc_filterpy.realtime import Supervisor
 
 Work = tuple[Callable[[], Any], int]
@@ -128,6 +140,32 @@ def process_block(name: str, block: int) -> Callable[[], Any]:
     for _ in range(max(8192 // block, 1)):
         run()
     return run
+
+
+# ---- Controllers that adapt once per block, beside FxLMS in compiled code, with many taps.
+
+LONG_TAPS = (512, 1024, 2048, 4096, 8192, 16384)
+LONG_BLOCK = 512
+LONG: dict[str, Callable[[int], Any]] = {
+    "FxLMS, compiled": lambda taps: FxLMS(taps, PATH, step_size=1e-9),
+    "frequency domain": partial(FrequencyDomainFxLMS, secondary_path=PATH, step_size=1e-6, block_size=LONG_BLOCK),
+    "one partition": lambda taps: FrequencyDomainFxLMS(
+        taps, PATH, step_size=1e-6, block_size=LONG_BLOCK, partition_size=taps
+    ),
+    "unconstrained": partial(
+        FrequencyDomainFxLMS, secondary_path=PATH, step_size=1e-6, block_size=LONG_BLOCK, constrained=False
+    ),
+    "subband, 64 bands": partial(SubbandFxLMS, secondary_path=PATH, step_size=1e-6, n_bands=64, block_size=LONG_BLOCK),
+    "frequency-domain Kalman": partial(FrequencyDomainKalman, secondary_path=PATH, block_size=LONG_BLOCK),
+}
+
+
+def long_filter(name: str, taps: int) -> Work:
+    """Time `process` of a controller with many taps, over a block of its own."""
+    controller, (x, e) = LONG[name](taps), _noise(LONG_BLOCK)
+    y = np.empty(LONG_BLOCK)
+    controller.process(x, e, out=y)
+    return lambda: controller.process(x, e, out=y), LONG_BLOCK
 
 
 def _noise(samples: int) -> tuple[np.ndarray, np.ndarray]:

@@ -34,6 +34,7 @@ PANELS = {
         *("MOV-FxLMS fixed", "MOV-FxLMS by variance", "MOV-FxLMS", "MOV-MFxLMS"),
     ),
     "FxLMS with an amplitude limit": ("two-gradient FxLMS", "re-scaling FxLMS", "clipping FxLMS"),
+    "FxLMS in the frequency domain": ("power-limited FxLMS", "band-limited FxLMS"),
 }
 
 TunedAt = Mapping[float, Mapping[str, Tuned]]  # by rated power and algorithm

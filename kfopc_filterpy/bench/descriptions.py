@@ -23,6 +23,9 @@ DESCRIPTIONS = {
     "two-gradient FxLMS": "FxLMS that descends on the output power instead while a sample is beyond an amplitude limit",
     "re-scaling FxLMS": "FxLMS that scales its weights down when a sample is beyond an amplitude limit",
     "clipping FxLMS": "FxLMS whose control signal is clipped at an amplitude limit",
+    "frequency-domain FxLMS": "FxLMS that adapts once per block, each frequency at its own rate; it knows no rated power",
+    "power-limited FxLMS": "frequency-domain FxLMS with a price on the output power that follows the measured power",
+    "band-limited FxLMS": "the same with a limit and a price for each octave, by the reference's power in it",
 }
 
 

@@ -33,6 +33,7 @@ PARAMETERS = {
     "measurement_noise_q": (r"q", "variance of the measurement noise"),
     "mu": (r"\mu", "step size"),
     "mu L E[x'^2]": (r"\mu L E[x'^2]", "step size, without units"),
+    "mu of a block": (r"\mu", "step size of a block, without units"),
     "n_taps": (r"L", "taps of the control filter"),
     "penalty factor over G_s": (r"\beta / G_s", "penalty factor, without units"),
     "primary_path": (r"P(z)", "primary path"),

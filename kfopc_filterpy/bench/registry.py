@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import (
+    BandLimitedFxLMS,
     ClippingFxLMS,
     DiagonalKalman,
+    FrequencyDomainFxLMS,
     FxLMS,
     FxNLMS,
     LeakyFxLMS,
@@ -42,6 +44,7 @@ STEP_SIZE_GRID = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
 DIAGONAL_GRID = (1e-12, 1e-11, 1e-10, 1e-9, *STATE_NOISE_GRID)
 FORGETTING_GRID = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
 PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer grid around the best value follows
+BLOCK_STEP_GRID = (0.02, 0.05, 0.1, 0.2, 0.4)  # divided by the power in each bin, so it needs no units
 PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1, 2.0)).tolist())
 
 Setting = float | tuple[float, float]
@@ -60,7 +63,8 @@ class Algorithm:
         Function of a scene, the first setting in the scene's units, and the second setting, which returns these keyword
         arguments; those that all algorithms share are left out.
     symbol : str
-        Parameter that the first setting sets: "r", "mu", "1 - lambda" or "averaging_s".
+        Parameter that the first setting sets: "r", "mu", "mu of a block", "1 - lambda" or
+        "averaging_s".
     kind : str
         The first setting as a formula, without units.
     first : tuple of float
@@ -83,6 +87,8 @@ class Algorithm:
         Whether it may stop during a run because it cannot continue, which counts as divergence.
     several_channels : bool, default False
         Whether the studies of several channels compare it; those of one channel compare all.
+    in_core : bool, default True
+        Whether it is in the compiled core, which can be exported.
     """
 
     make: Callable[..., Controller]
@@ -99,6 +105,7 @@ class Algorithm:
     knows_amplifier: bool = False
     may_refuse: bool = False
     several_channels: bool = False
+    in_core: bool = True
 
     @property
     def grid(self) -> list[Setting]:
@@ -179,6 +186,28 @@ def _two_gradients(scene: Scene, mu: float, share: float) -> dict[str, Any]:
     return _peak(scene, mu, share) | {"output_step_size": mu * scene.secondary_gain}
 
 
+def _in_blocks(scene: Scene, mu: float, _: float) -> dict[str, Any]:
+    """Take one partition, for fine bins, and four blocks in it."""
+    block = -(-scene.n_taps // 4)
+    return {"step_size": mu, "block_size": block, "partition_size": 4 * block}
+
+
+def _within_power(scene: Scene, mu: float, _: float) -> dict[str, Any]:
+    limits = {"band_edges": (0.0, scene.fs / 2), "band_powers": [scene.rated_power], "fs": scene.fs}
+    return _in_blocks(scene, mu, np.nan) | limits
+
+
+def _within_bands(scene: Scene, mu: float, _: float) -> dict[str, Any]:
+    """Divide the rated power among octaves as the reference divides its own: the control filter's gain has one limit."""
+    settings = _in_blocks(scene, mu, np.nan)
+    octaves = min(int(np.log2((settings["block_size"] + settings["partition_size"]) / 2)), 6)  # none below the bins
+    edges = np.append(0.0, scene.fs / 2 * 2.0 ** np.arange(-octaves, 1))
+    spectrum = np.abs(np.fft.rfft(scene.settled[0])) ** 2
+    bands = np.histogram(np.linspace(0.0, scene.fs / 2, spectrum.size), edges, weights=spectrum)[0]
+    shares = np.maximum(bands / bands.sum(), 1e-6)  # a limit must not be zero
+    return settings | {"band_edges": edges, "band_powers": scene.rated_power * shares, "fs": scene.fs}
+
+
 def _constrained(settings: Settings) -> Settings:
     """Return a function that adds the scene's constraint, or one for each loudspeaker, to `settings`."""
 
@@ -210,6 +239,12 @@ _BUDGET: dict[str, Any] = {
     "first": (DEFAULT_AVERAGING_S,),
     "knows_amplifier": True,
 }
+_BLOCKS: dict[str, Any] = {
+    "symbol": "mu of a block",
+    "kind": "mu of a block",
+    "first": BLOCK_STEP_GRID,
+    "in_core": False,
+}
 _FREE: dict[str, Any] = {"keeps_budget": False, "sees_budget": False}
 _KNOWS: dict[str, Any] = {"knows_amplifier": True}
 _CHANNELS: dict[str, Any] = {"several_channels": True}
@@ -234,6 +269,9 @@ REGISTRY: dict[str, Algorithm] = {
     "two-gradient FxLMS": Algorithm(TwoGradientFxLMS, _two_gradients, **_PEAK, **_CHANNELS),
     "re-scaling FxLMS": Algorithm(RescalingFxLMS, _peak, **_PEAK, **_CHANNELS),
     "clipping FxLMS": Algorithm(ClippingFxLMS, _peak, **_PEAK, **_CHANNELS),
+    "frequency-domain FxLMS": Algorithm(FrequencyDomainFxLMS, _in_blocks, **_BLOCKS, **_FREE),
+    "power-limited FxLMS": Algorithm(BandLimitedFxLMS, _within_power, **_BLOCKS),
+    "band-limited FxLMS": Algorithm(BandLimitedFxLMS, _within_bands, **_BLOCKS),
 }
 
 

@@ -79,7 +79,7 @@ def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | Non
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path} is not TOML: {error}") from error
-    makers: dict[str, Any] = {name: own.make for name, own in algorithms().items()}
+    makers: dict[str, Any] = {name: own.make for name, own in algorithms().items() if own.in_core}
     makers[FastArrayKalman.name] = FastArrayKalman
     make = makers[as_choice(settings.pop("algorithm", None), f"algorithm in {path}", makers)]
     given_fs = settings.pop("fs", None)

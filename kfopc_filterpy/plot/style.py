@@ -34,6 +34,9 @@ STYLES: dict[str, tuple[str, Any, str]] = {
     "MOV-FxLMS fixed": ("#117733", _DASHED, "2"),
     "MOV-FxLMS by variance": ("#661100", _DASHED, "4"),
     "MOV-MFxLMS": ("#88CCEE", _DASHED, "3"),
+    "frequency-domain FxLMS": ("#CC6677", "-", "H"),
+    "power-limited FxLMS": ("#DDAA33", "-", "H"),
+    "band-limited FxLMS": ("#6699CC", "-", "H"),
 }
 UNLISTED = ("#000000", ":", "x")  # an algorithm that is not in the table
 COLOURS = 6  # curves without an algorithm take the colours and markers of the first so many rows

@@ -26,6 +26,7 @@ def small():
     own = {"block_times": lambda: BLOCK_TIMES(6400), "find_spec": lambda name: None}
     variants = {
         "CHANNELS": [(1, 2, 3, 16)],
+        "LONG_TAPS": (512, 1024),
         "BLOCK_CONTROLLERS": {"FxLMS, 256 taps": speed_variants.BLOCK_CONTROLLERS["FxLMS, 256 taps"]},
         "samples_for": lambda taps, most=0, least=0: 96,
     }
@@ -57,7 +58,11 @@ def test_the_command_writes_what_it_measured(small, tmp_path, capsys):
         assert block["shares"][0] == pytest.approx(
             [block[key] * 16e3 / 1e6 / length for key in ("median_us", "percentile_99_99_us", "worst_us")]
         )
+    assert {(row["controller"], row["taps"]) for row in result["long"]} == {
+        (name, taps) for name in speed_variants.LONG for taps in (512, 1024)
+    }
     printed = capsys.readouterr().out
+    assert "FxLMS, compiled                             1.00      1.00" in printed
     assert "FxLMS, 256 taps                 16" in printed
     assert "     1 x  2 x  3,   16" in printed
     assert "times as fast as filterpy" in printed
