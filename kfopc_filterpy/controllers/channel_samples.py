@@ -26,7 +26,7 @@ def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndar
 
 def require_moderate(signal: np.ndarray, name: str, most: float = LOUDEST) -> None:
     """Raise ValueError for samples from which a state could overflow."""
-    if np.any(np.abs(signal) > most):
+    if np.abs(signal).max() > most:
         raise ValueError(f"{name} must not be louder than {most:g}: scale the signals; nothing was changed")
 
 
