@@ -1,5 +1,4 @@
 from .base import Controller as Controller
-from .block import BlockController as BlockController
 from .core_controller import CoreController as CoreController
 from .core_controller import load_algorithm as load_algorithm
 from .direct import DirectKalman as DirectKalman

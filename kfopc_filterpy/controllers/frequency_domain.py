@@ -59,9 +59,10 @@ class FrequencyDomainFxLMS(BlockController):
 
     Notes
     -----
-    The control signal has no delay, see `BlockController`. A block takes some ``4 P`` transforms of ``N + B`` samples with
-    the constraint, and a fixed number without; a sample takes B multiplications. For a limiter, wrap it in a
-    `LimitedController`. Samples above 1e20 are refused.
+    The control signal has no delay: what earlier samples contribute to it is computed when a block begins, and the block's
+    own samples take B multiplications each. A block takes some ``4 P`` transforms of ``N + B`` samples with the constraint,
+    and a fixed number without. If the secondary path is longer than a block, the step size must be smaller. For a limiter,
+    wrap it in a `LimitedController`. Samples above 1e20 are refused.
 
     References
     ----------

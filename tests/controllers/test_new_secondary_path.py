@@ -13,6 +13,7 @@ from helpers.loop import FS, MU, N_TAPS, P0, S_HAT, Q, R, noises
 from kfopc_filterpy import (
     DiagonalKalman,
     FastArrayKalman,
+    FrequencyDomainFxLMS,
     FxLMS,
     FxNLMS,
     KalmanController,
@@ -35,6 +36,7 @@ MAKERS: dict[str, Any] = {
     "KF-OPC repaired": lambda s: kf_opc_repaired(N_TAPS, s, rated_power=1e6, **KALMAN),
     "filterpy": lambda s: KalmanController(KalmanFilter(N_TAPS, 1), s),
     "diagonal KF": lambda s: DiagonalKalman(N_TAPS, s, **KALMAN),
+    "frequency domain": lambda s: FrequencyDomainFxLMS(N_TAPS, s, step_size=MU, block_size=4, forgetting=None),
 }
 
 

@@ -21,8 +21,9 @@ from hypothesis import strategies as st
 import kfopc_filterpy
 from kfopc_filterpy import FxLMS, controllers
 from kfopc_filterpy.checkpoint import Checkpointed
-from kfopc_filterpy.controllers import BlockController, VerifiedController
+from kfopc_filterpy.controllers import VerifiedController
 from kfopc_filterpy.controllers.base import WrappedController
+from kfopc_filterpy.controllers.block import BlockController
 from kfopc_filterpy.controllers.core_controller import CoreController
 from kfopc_filterpy.controllers.posterior import PathObserver, PosteriorController
 
