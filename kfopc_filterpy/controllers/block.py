@@ -14,6 +14,8 @@ from .channel_samples import LOUDEST, require_moderate
 from .channels import Channels
 from .processing import BlockProcessing, adapt_flags, output_array, require_apart, require_one_length
 
+LOUDEST_ERROR = 1e100  # as loud as the weights that are kept can make it, so that it can fall again
+MOST_WEIGHT = 1e80  # a step that leads beyond it is left out
 ROUNDING = 1e-12  # -120 dB; rounding errors are at -300 dB
 TINY = float(np.finfo(float).tiny)
 
@@ -141,7 +143,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         return irfft(spectra, self.partition_size + self.block_size)[..., self.partition_size :]
 
     def _adapt(self) -> None:
-        """Change the control filter's spectra after a block, of which at least one error was taken."""
+        """Replace the control filter's spectra after a block, of which at least one error was taken."""
         raise NotImplementedError
 
     def _follow(self) -> None:
@@ -158,8 +160,11 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
             spectra[..., 1:, :] = spectra[..., :-1, :]
             spectra[..., 0, :] = newest
         self._follow()
+        before = self._W
         if self._taken.any():
             self._adapt()
+        if np.abs(self._W.view(float)).max() > MOST_WEIGHT:
+            self._W = before
         self._errors[:], self._taken[:], self._n = 0.0, False, 0
         # The next block: its own samples are zero as yet.
         heard = np.concatenate((self._references[:, -N:], np.zeros((self.n_references, B))), axis=1)
@@ -200,7 +205,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
     def update(self, error: NumberOrArray) -> None:
         """Take the error e(n), with several channels (K,), that the last control signal left; adapt after B samples."""
         e = self._sample(error, "error", "microphones")
-        require_moderate(e, "error")
+        require_moderate(e, "error", LOUDEST_ERROR)
         if self._n == 0:
             raise ValueError("update must follow the control_signal of its sample, but a new block has just begun")
         self._errors[:, self._n - 1], self._taken[self._n - 1] = e, True
@@ -213,7 +218,8 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
         x = self._block_signal(references, "references", self.n_references)
         e = self._block_signal(errors, "errors", self.n_microphones)
-        if calls_of(type(self)) != calls_of(BlockController) or max(np.abs(x).max(), np.abs(e).max()) > LOUDEST:
+        loud = np.abs(x).max() > LOUDEST or np.abs(e).max() > LOUDEST_ERROR
+        if loud or calls_of(type(self)) != calls_of(BlockController):
             return super().process(x, e, adapt=adapt, out=out)  # as far as the sample that is refused
         require_one_length(x, e)
         flags = adapt_flags(adapt, x.shape[-1])
