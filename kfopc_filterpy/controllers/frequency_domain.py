@@ -62,8 +62,7 @@ class FrequencyDomainFxLMS(BlockController):
     The control signal has no delay: what earlier samples contribute to it is computed when a block begins, and the block's
     own samples take B multiplications each. A block takes some ``4 P`` transforms of ``N + B`` samples with the constraint,
     and a fixed number without. If the secondary path is longer than a block, the step size must be smaller. For a limiter,
-    wrap it in a `LimitedController`. References above 1e20 and errors above 1e100
-    are refused.
+    wrap it in a `LimitedController`. References above 1e20 and errors above 1e100 are refused.
 
     References
     ----------

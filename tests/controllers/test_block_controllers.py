@@ -106,9 +106,9 @@ def near_wiener(**settings: Any) -> Any:
     [
         pytest.param(near_wiener(), 0.3, id="partitions"),
         pytest.param(near_wiener(partition_size=128), 0.3, id="one partition"),
-        pytest.param(near_wiener(constrained=False), 3.0, id="unconstrained"),
+        pytest.param(near_wiener(constrained=False), 1.0, id="unconstrained"),
         pytest.param(FrequencyDomainKalman(128, SECONDARY, block_size=32), 1.5, id="Kalman"),
-        pytest.param(SubbandFxLMS(128, SECONDARY, step_size=0.15, n_bands=16, block_size=32), 3.0, id="subband"),
+        pytest.param(SubbandFxLMS(128, SECONDARY, step_size=0.15, n_bands=16, block_size=32), 4.0, id="subband"),
     ],
 )
 def test_it_settles_near_the_best_filter(controller: Any, loss_db: float) -> None:
