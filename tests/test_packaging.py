@@ -25,7 +25,8 @@ README_COMMANDS = [
     f'{SET_UP} ".[studies]" && .venv/bin/python -m comparisons',
     f'{SET_UP} ".[docs]" && .venv/bin/python -m sphinx -W -j auto docs docs/_build/html',
 ]
-NOT_FOR_TESTS = ("bench", "docs", "fmu", "realtime")  # extras that the tests run without
+# Extras and groups that the tests run without.
+NOT_FOR_TESTS = ("bench", "docs", "fmu", "realtime", "coverage", "dev", "lint", "mutants")
 LOADED_WHEN_FIRST_USED = ("control", "h5py", "matplotlib", "pooch", "pyuff", "soundfile", "tqdm")
 
 
@@ -44,11 +45,12 @@ def pins() -> dict[str, str]:
 
 
 def requirements(without: tuple[str, ...] = ()) -> list[Requirement]:
-    """Return what pyproject.toml asks for, extras but those named included, the package itself left out."""
-    project = tomllib.loads(read("pyproject.toml"))["project"]
-    extras = [lines for name, lines in project["optional-dependencies"].items() if name not in without]
-    groups = [project["dependencies"], *extras]
-    parsed = [Requirement(line) for group in groups for line in group]
+    """Return what pyproject.toml asks for, extras and groups but those named included, the package itself left out."""
+    tables = tomllib.loads(read("pyproject.toml"))
+    project = tables["project"]
+    named = project["optional-dependencies"] | tables["dependency-groups"]
+    groups = [project["dependencies"], *(lines for name, lines in named.items() if name not in without)]
+    parsed = [Requirement(line) for group in groups for line in group if isinstance(line, str)]
     return [requirement for requirement in parsed if requirement.name != DISTRIBUTION]
 
 
@@ -119,7 +121,7 @@ def test_every_requirement_is_pinned_within_its_range():
 def test_everything_an_install_brings_is_pinned():
     """Follow the requirements of what is installed, from this package's own down to the last.
 
-    The extras bench and docs need not be installed; what of them is, is followed too.
+    What NOT_FOR_TESTS names need not be installed; what of it is, is followed too.
     """
     versions = pins()
     always = {str(canonicalize_name(requirement.name)) for requirement in requirements(without=NOT_FOR_TESTS)}

@@ -165,7 +165,7 @@ class InUse:
     def __enter__(self) -> None:
         self.enter()
 
-    def __exit__(self, *_: Any) -> None:
+    def __exit__(self, *_: object) -> None:
         self.leave()
 
 

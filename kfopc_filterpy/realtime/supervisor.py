@@ -401,7 +401,7 @@ class Supervisor(Checkpointed):
                     if refusals == MOST_REFUSALS:
                         self._refused += int(np.count_nonzero(adapt[done + begin :]))
                         adapt = np.zeros_like(adapt)
-                except Exception as error:  # whatever it is, the loudspeakers must not be left with it
+                except Exception as error:  # noqa: BLE001 - whatever it is, the loudspeakers must not be left with it
                     self._stop(f"diverged: {type(error).__name__}: {error}", at_once=True)
                     return y
                 y[:, begin : begin + done] = room[:, :done]

@@ -73,7 +73,7 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, ValueError) and str(path) in str(error):
             raise
-        raise ValueError(f"{path} cannot be read as {what}: {error or type(error).__name__}") from error
+        raise ValueError(f"{path} cannot be read as {what}: {str(error) or type(error).__name__}") from error
 
 
 def optional_module(name: str, path: str | os.PathLike[str], what: str) -> ModuleType:
@@ -201,7 +201,7 @@ def _name_of(
             return next(iter(shapes))
         few = "several variables" if names else "no signal"
         rest = "" if names else "".join(f", {name} ({kind})" for name, kind in sorted(others.items()))
-        example = sorted(names or others or shapes)[0]
+        example = min(names or others or shapes)
         raise ValueError(
             f"{path} holds {few}: {there}{rest}; choose one with the option variable (in a command also "
             f"{Path(path).name}:{example})"

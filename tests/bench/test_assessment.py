@@ -285,9 +285,8 @@ def test_the_page_says_where_it_comes_from_and_no_watts_that_are_not_known(tmp_p
         )
         for v in (4.0, None)
     )
-    pages = []
-    for verdict in (known, replace(unknown, origin={"Files": "<a>.wav, 24000 samples"})):
-        pages.append(verdict.write(tmp_path).read_text(encoding="utf-8"))
+    named = replace(unknown, origin={"Files": "<a>.wav, 24000 samples"})
+    pages = [verdict.write(tmp_path).read_text(encoding="utf-8") for verdict in (known, named)]
     assert known.limits.rated_power == unknown.limits.rated_power / 16 == 1.0
     assert "with 2 W into 8 ohm" in known.verdict
     assert "Power (W into 8 ohm)" in pages[0]

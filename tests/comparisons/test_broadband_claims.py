@@ -100,7 +100,7 @@ def clipped(**own: list[float]) -> dict[str, dict[str, Any]]:
         "output_power_of_each_seed": [0.79, 0.8],
         "clipped_fraction": 0.157,
     }
-    return {name: figures for name in (UNAWARE, KNOWING)} | {"KF-OPC": figures | own}
+    return dict.fromkeys((UNAWARE, KNOWING), figures) | {"KF-OPC": figures | own}
 
 
 @pytest.mark.parametrize(

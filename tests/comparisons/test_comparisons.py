@@ -155,4 +155,4 @@ def test_command_writes_report_and_results(tmp_path, capsys):
     assert set(study["algorithms"]) == set(PAPER)
     assert study["extra"]["overdrive_db"] == [0.0, 3.0, 10.0]
     assert (tmp_path / "out" / "report.html").stat().st_size > 100_000
-    assert sorted(p.name for p in (tmp_path / "out" / "audio").iterdir())[0] == "tonal-disturbance.wav"
+    assert min(p.name for p in (tmp_path / "out" / "audio").iterdir()) == "tonal-disturbance.wav"

@@ -90,7 +90,7 @@ def started(*command, folder, log):
             stdout=output,
             stderr=subprocess.STDOUT,
             start_new_session=True,
-            preexec_fn=heed_interrupts,
+            preexec_fn=heed_interrupts,  # noqa: PLW1509 - it sets a signal, and starts no thread
         )
     try:
         yield process

@@ -248,7 +248,7 @@ def test_the_reader_of_cells_finds_those_that_draw():
     drawn = "```{code-cell} python\nfigure, ax = plt.subplots()\n```"
     hidden = "```{code-cell} python\n:tags: [remove-cell]\nplot_nse(run)\n```"
     computed = "```{code-cell} python\nfrom kfopc_filterpy.plot import plot_nse\n```"
-    assert drawing_cells("\n\n".join([computed, drawn, hidden])) == [drawn]
+    assert drawing_cells(f"{computed}\n\n{drawn}\n\n{hidden}") == [drawn]
 
 
 # The theory.

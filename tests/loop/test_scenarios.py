@@ -338,7 +338,7 @@ HEARD = r"controllers\[2\] must agree in the reference heard so far"
 TWICE = r"controllers\[1\] is in the list twice"
 AGREE = r"controllers\[0\] and controllers\[1\] must agree in "
 REFUSED = [
-    (lambda: [], ValueError, "controllers must hold one controller at least"),
+    (list, ValueError, "controllers must hold one controller at least"),
     (
         lambda: [*filters(2), FxLMS(7, S_HAT, step_size=0.1)],
         ValueError,

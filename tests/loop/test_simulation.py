@@ -161,7 +161,7 @@ def test_a_users_own_amplifier(name):
     result = simulate(MAKERS[name](), X, disturbance=D, secondary_path=S, amplifier=math.tanh)
     np.testing.assert_array_equal(result.amplifier_output, [math.tanh(y) for y in result.control_signal])
     clip = HardClipAmplifier(0.4)
-    own = simulate(MAKERS[name](), X, disturbance=D, secondary_path=S, amplifier=lambda y: clip(y))
+    own = simulate(MAKERS[name](), X, disturbance=D, secondary_path=S, amplifier=clip)
     assert_same_run(own, simulate(MAKERS[name](), X, disturbance=D, secondary_path=S, amplifier=clip))
 
 

@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pytest
@@ -160,7 +161,7 @@ def test_what_the_search_found_to_end_the_process_within_scipy_is_refused(name, 
 class Memory:
     """The most bytes that Python and numpy held within a `with` block, beyond what they held before."""
 
-    def __enter__(self) -> Memory:
+    def __enter__(self) -> Self:
         gc.collect()
         tracemalloc.start()
         return self
