@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import os
+from argparse import ArgumentParser, _SubParsersAction
 from pathlib import Path
 from typing import Any
 
 import kfopc_filterpy
+from kfopc_filterpy.commands import whole_parser
 
 NOT_OURS = "KalmanFilter,tuple,Protocol,Exception"  # bases whose members are described elsewhere
 NAMESPACES = (
@@ -85,14 +88,38 @@ def index_page() -> str:
         for name in [name for name in folders if folders[name] == folder]:
             lines += [f"   * - :doc:`{name} <{name}>`", f"     - {summary(thing_of(name))}"]
         lines.append("")
-    return "\n".join([*lines, ".. toctree::", "   :hidden:", "", *(f"   {name}" for name in public_names()), ""])
+    lines += [
+        "The command",
+        "-----------",
+        "",
+        ":doc:`kfopc <kfopc>`: every subcommand, its options and the exit codes",
+        "",
+    ]
+    pages = ["kfopc", *public_names()]
+    return "\n".join([*lines, ".. toctree::", "   :hidden:", "", *(f"   {name}" for name in pages), ""])
+
+
+def command_page() -> str:
+    """Return the help of the command and of each subcommand."""
+    os.environ["COLUMNS"] = "120"  # argparse wraps to the width of a terminal
+    lines: list[str] = []
+
+    def add(parser: ArgumentParser, underline: str) -> None:
+        help_lines = [f"   {line}".rstrip() for line in parser.format_help().splitlines()]
+        lines.extend([parser.prog, underline * len(parser.prog), "", ".. code-block:: text", "", *help_lines, ""])
+        for action in parser._actions:
+            for below in (action.choices or {}).values() if isinstance(action, _SubParsersAction) else ():
+                add(below, "-")
+
+    add(whole_parser(), "=")
+    return "\n".join(lines)
 
 
 def write_pages(app: Any) -> None:
     """Write what has changed, and remove pages of names that are gone."""
     folder = Path(app.srcdir) / "reference"
     folder.mkdir(exist_ok=True)
-    pages = {"index": index_page()}
+    pages = {"index": index_page(), "kfopc": command_page()}
     pages |= {name: name_page(name) for name in public_names()}
     for path in folder.glob("*.rst"):
         if path.name.removesuffix(".rst") not in pages:

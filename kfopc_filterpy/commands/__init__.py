@@ -1,8 +1,4 @@
-"""The command `kfopc`, which is also `python -m kfopc_filterpy`: a file for each subcommand.
-
-Exit codes: 0 if the command is done, or the verdict is "enough"; 1 if the verdict is "not enough", or a fault stopped a
-run; 2 for wrong input, with a message of one line; 130 if it was interrupted; 141 if its output's reader went away.
-"""
+"""The command `kfopc`, which is also `python -m kfopc_filterpy`: a file for each subcommand."""
 
 from __future__ import annotations
 
@@ -12,7 +8,8 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from . import compare, data, demo, explore, export, paths, run, verdict
+from .. import __version__
+from . import compare, completion, data, demo, explore, export, paths, run, verdict
 from .options import WRONG_INPUT, Parser
 
 PIPE_CLOSED = 141  # as of a program that SIGPIPE ends
@@ -26,7 +23,9 @@ EXAMPLES = """examples:
   kfopc explore
   kfopc data list
   kfopc demo FOLDER
-each command has its own --help"""
+each command has its own --help
+exit codes: 0 done, or the verdict is "enough"; 1 the verdict is "not enough", or a fault stopped a run; 2 wrong input,
+with a message of one line; 130 interrupted; 141 the reader of its output went away"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 done or enough, 1 not enough or stopped by a fault, 2 wrong input, 130 interrupted, 141 nobody reads.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    options, unknown = _parser().parse_known_args(
+    options, unknown = whole_parser().parse_known_args(
         arguments, argparse.Namespace(command=shlex.join(["kfopc", *arguments]))
     )
     try:
@@ -63,14 +62,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
-def _parser() -> Parser:
+def whole_parser() -> Parser:
+    """Return the parser of the command and its subcommands."""
     parser = Parser(
         prog="kfopc",
         description="Active noise control with a limited amplifier, from recordings.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action="version", version=f"kfopc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for module in (verdict, compare, paths, run, export, explore, data, demo):
         module.add_to(commands)
+    completion.add_to(commands, parser)
     return parser

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable
 from itertools import count
@@ -58,6 +59,7 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     about = "seconds of noise played to identify the paths (default: 5)"
     add_number(parser, "--identify", "s", default=5.0, help=about)
     parser.add_argument("--quiet", action="store_true", help="print only the result")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -83,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
         return FAULT
     if show is not None and sys.stderr.isatty():
         print(file=sys.stderr)  # the line of the status ends
-    print(_summary(report, interface.fs, interface.block))
+    print(_facts(report) if options.json else _summary(report, interface.fs, interface.block))
     return FAULT if report.stopped_by.startswith("fault") else DONE
 
 
@@ -202,6 +204,14 @@ def _powers(report: RunStatus | RunReport, of: str = "") -> str:
         f"{p:.3g} ({100 * p / r:.0f} %{of})"
         for p, r in zip(report.powers, np.broadcast_to(rated, report.powers.shape), strict=True)
     )
+
+
+def _facts(report: RunReport) -> str:
+    """Return a report as JSON, without the arrays of the path and the controller."""
+    from ..bench.study_report import jsonable
+
+    facts = {name: value for name, value in vars(report).items() if name not in ("secondary_path", "controller")}
+    return json.dumps(jsonable(facts | {"health": [vars(event) for event in report.health.events]}), indent=2)
 
 
 def _summary(report: RunReport, fs: float, block: int) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
+import shutil
 import subprocess
 import sys
 
@@ -12,7 +14,7 @@ import pytest
 import scipy.signal
 from helpers.commands import FS, ROOT, SCENE, process
 
-from kfopc_filterpy import bench
+from kfopc_filterpy import __version__, bench
 from kfopc_filterpy.signals import write_wav
 
 
@@ -22,6 +24,33 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
     assert ended.stdout == b""
     assert ended.stderr.startswith(b"kfopc verdict: nose.wav does not exist")
     assert ended.stderr.count(b"\n") == 1
+
+
+def test_the_version_is_printed(command):
+    assert command("--version") == (0, f"kfopc {__version__}\n", "")
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        (["ver"], ["verdict"]),
+        (["verdict", "--pri"], ["--primary"]),
+        (["data", "fe"], ["fetch"]),
+        (["verdict", "--primary", "P"], ["P.wav"]),
+        (["paths", "resample", "S"], ["S.wav", "S16.wav"]),
+    ],
+)
+def test_bash_completes_commands_options_and_files(folder, command, words, completed):
+    script = command("completion", "bash")[1]
+    script += f"""
+COMP_WORDS=(kfopc {shlex.join(words)})
+COMP_CWORD={len(words)}
+_shtab_kfopc kfopc {words[-1]} {["kfopc", *words][-2]}
+printf '%s\\n' "${{COMPREPLY[@]}}"
+"""
+    ran = subprocess.run(["bash", "-c", script], cwd=folder, capture_output=True, text=True)
+    assert sorted(ran.stdout.split()) == completed, ran.stderr
 
 
 @pytest.mark.parametrize(

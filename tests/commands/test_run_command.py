@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import numpy as np
@@ -64,6 +65,12 @@ def test_the_command_says_if_its_blocks_make_the_anti_noise_late(command, tmp_pa
     assert code == 0
     assert "if the anti-noise comes too late, use a smaller --block: two blocks of 40 samples are 10 ms" in out
     assert err == ""
+    code, printed, err = command("run", *given, *options, "--block", "40", "--seconds", "1", "--json")
+    facts = json.loads(printed)
+    assert (code, err, facts["stopped_by"], facts["health"]) == (0, "", "end", [])
+    assert f"reach {facts['possible_db']:.1f} dB" in out
+    assert f"noise reduction {facts['reduction_db'][0]:.1f} dB" in out
+    assert f"output power {facts['powers'][0]:.3g} (" in out
 
 
 def test_a_plant_of_several_channels_is_simulated(command, tmp_path):
