@@ -9,8 +9,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import os
+import random
 import re
+import shutil
+import sqlite3
 from pathlib import Path
 
 import nox
@@ -102,7 +107,7 @@ def ends_of_the_range(session: nox.Session, end: str) -> None:
     # README's Install section, from the wheel in an empty environment: every public name, and README's examples.
     session.run("python", "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(work / "dist"), ".")
     session.run("python", "-m", "venv", "--clear", str(work / "empty"))
-    python = str(next((work / "empty").glob("*/python*")))
+    python = str(work / "empty" / ("Scripts" if os.name == "nt" else "bin") / "python")
     (wheel,) = (work / "dist").glob("*.whl")
     session.run(python, "-m", "pip", "install", "-q", *limits, str(wheel), external=True)
     session.run(python, "-m", "pip", "check", external=True)
@@ -121,6 +126,41 @@ def lower_bounds() -> list[str]:
                 raise ValueError(f"two lower bounds of {name}: {bounds[name]} and {version}")
     # matplotlib 3.8 calls names that pyparsing 3.3 warns about, and does not bound it.
     return [*(f"{name}=={version}" for name, version in sorted(bounds.items())), "pyparsing<3.3"]
+
+
+@nox.session(default=False)
+def mutants(session: nox.Session) -> None:
+    """Change a package at some random places, and print the changes that its tests miss: `-- power 40`.
+
+    The packages are the files in tests/mutants/, and so are the tests that must fail. Without a number, every mutant is run.
+    """
+    name, *number = session.posargs or ["power", "40"]
+    tree = Path(session.create_tmp()).resolve() / "tree"
+    shutil.rmtree(tree, ignore_errors=True)
+    session.run("git", "checkout-index", "--all", f"--prefix={tree}/", external=True)  # what is changed is a copy
+    session.install(*PINNED, "-e", f"{tree}[test]")
+    install_group(session, "mutants")
+    with session.chdir(tree):
+        config, found = f"tests/mutants/{name}.toml", f"{name}.sqlite"
+        session.run("cosmic-ray", "init", config, found)
+        session.run("cr-filter-operators", found, config)
+        if number:
+            keep_some(found, int(number[0]))
+        # Python compares the times and sizes of files, which a mutant may share with the file before it.
+        session.run("cosmic-ray", "exec", config, found, env={"PYTHONDONTWRITEBYTECODE": "1"})
+        session.run("cr-report", "--surviving-only", "--show-diff", found)
+
+
+def keep_some(found: str, count: int) -> None:
+    """Leave a number of mutants that wait in a session of cosmic-ray, the same ones each time, and remove the others."""
+    with contextlib.closing(sqlite3.connect(found)) as database, database:
+        waiting = database.execute(
+            "SELECT job_id FROM mutation_specs WHERE job_id NOT IN (SELECT job_id FROM work_results) "
+            "ORDER BY module_path, start_pos_row, start_pos_col, operator_name, operator_args, occurrence"
+        ).fetchall()
+        kept = [job for (job,) in random.Random(0).sample(waiting, count)]
+        for table in ("work_results", "mutation_specs", "work_items"):
+            database.execute(f"DELETE FROM {table} WHERE job_id NOT IN ({', '.join('?' * count)})", kept)
 
 
 @nox.session(venv_backend="none", default=False)
