@@ -157,15 +157,16 @@ def test_any_algorithm_of_the_core(name):
 
 @pytest.mark.parametrize("primary", [False, True])
 def test_what_is_one_for_all(primary):
-    """One amplifier, path, disturbance or primary path; and one seed: each hears the same noise."""
+    """One amplifier, path, disturbance or primary path; and one seed: each hears the same noise, and before the switch."""
     x, own = differing(1, 300)
     options = {"amplifier": HardClipAmplifier(0.7), "sensor_noise_std": 0.1, "rng": 5, "secondary_path": S.tolist()}
+    options["switch_on_s"] = 20 / FS
     options |= {"primary_path": [0.0, 0.0, 1.2, -0.7]} if primary else {"disturbance": own["disturbance"][0]}
     made, alone = filters(9), filters(9)
     results = run_scenarios(made, x, fs=FS, **options)
     assert_as_alone(results, one_by_one(alone, x, {}, **options), made, alone)
     noise = results[0].error - results[0].disturbance + results[0].anti_noise
-    np.testing.assert_allclose(noise, 0.1 * np.random.default_rng(5).standard_normal(300), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(noise, 0.1 * np.random.default_rng(5).standard_normal(300)[20:], rtol=0, atol=1e-14)
 
 
 def test_systems_generators_and_other_sequences_one_each():

@@ -114,6 +114,16 @@ def test_the_limiter_of_a_thermal_rating_lets_a_burst_pass_and_holds_the_mean():
         (lambda: LoudspeakerRating(8.0), ValueError, "one of noise_watt, sine_watt and programme_watt"),
         (lambda: LoudspeakerRating(8.0, x_max_mm=3.0), ValueError, "must be given together"),
         (
+            lambda: LoudspeakerRating(8.0, noise_watt=1.0, displacement_mm_per_volt=1.0),
+            ValueError,
+            "must be given together",
+        ),
+        (
+            lambda: LoudspeakerRating(([50.0, 80.0], [8.0, 0.0]), noise_watt=1.0),
+            ValueError,
+            "greater than 0 ohm, got 0",
+        ),
+        (
             lambda: LoudspeakerRating(([100.0, 50.0], [8.0, 8.0]), noise_watt=1.0),
             ValueError,
             "frequencies of ohm must rise",
@@ -141,7 +151,7 @@ def test_the_limiter_of_a_thermal_rating_lets_a_burst_pass_and_holds_the_mean():
             "displacement_mm needs",
         ),
     ],
-    ids=range(15),
+    ids=range(17),
 )
 def test_a_rating_that_says_nothing_or_too_much_is_refused(make, error, message):
     with pytest.raises(error, match=message):
