@@ -130,6 +130,7 @@ def test_the_limiter_of_a_thermal_rating_lets_a_burst_pass_and_holds_the_mean():
         ),
         (lambda: LoudspeakerRating(([50.0], [8.0, 8.0]), noise_watt=1.0), ValueError, "a value for each frequency"),
         (lambda: LoudspeakerRating("8", noise_watt=1.0), TypeError, "ohm must be a single number"),
+        (lambda: LoudspeakerRating([8.0, 8.0, 8.0], noise_watt=1.0), TypeError, "ohm must be a number in ohm, or freq"),
         (lambda: output_limits([]), ValueError, "at least one rating"),
         (lambda: output_limits("20 W"), TypeError, "rating must be a rated power"),
         (lambda: output_limits(-1.0), ValueError, "rating must be greater than 0"),
@@ -151,7 +152,7 @@ def test_the_limiter_of_a_thermal_rating_lets_a_burst_pass_and_holds_the_mean():
             "displacement_mm needs",
         ),
     ],
-    ids=range(17),
+    ids=range(18),
 )
 def test_a_rating_that_says_nothing_or_too_much_is_refused(make, error, message):
     with pytest.raises(error, match=message):
