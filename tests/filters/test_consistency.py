@@ -15,6 +15,9 @@ from kfopc_filterpy import KFOPC
 from kfopc_filterpy.filters import consistency
 from kfopc_filterpy.plot import plot_consistency
 
+# filterpy 1.4.5's `mahalanobis`, which a Saver asks for.
+pytestmark = pytest.mark.filterwarnings("ignore:Conversion of an array with ndim > 0:DeprecationWarning")
+
 F = np.array([[1.0, 0.5], [0.0, 1.0]])
 H = np.array([[1.0, 0.0], [1.0, 1.0]])
 Q, R = np.array([[0.02, 0.04], [0.04, 0.16]]), np.array([[1.0, 0.3], [0.3, 0.5]])

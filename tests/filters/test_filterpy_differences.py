@@ -72,6 +72,7 @@ def require_outcome(kind: type, code: str, cell: str) -> None:
     """The code does with a filter of this kind what the cell says."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # numpy's, of overflow and of imaginary parts that are dropped
+        warnings.filterwarnings("error", "Conversion of an array with ndim > 0")  # an error from numpy 2.4 on
         if not cell.startswith("as `"):
             assert outcome(kind, code) == cell, code
             return

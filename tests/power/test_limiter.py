@@ -219,6 +219,17 @@ def test_rare_peaks_over_the_amplitude_limit_are_clipped_alone() -> None:
     assert limiter.clipped == np.sum(y != u) > 0
 
 
+@pytest.mark.parametrize("rated_power", [1.0, 4.0])
+def test_a_quiet_past_of_another_limiter_takes_no_more_than_its_power(rated_power: float) -> None:
+    quiet = np.full(64, 0.5)
+    before, after = limiter(64, rated_power=0.64), limiter(64, rated_power=rated_power)
+    played = before.process(quiet)
+    after.follow(before)
+    out = after.process(quiet)
+    np.testing.assert_array_equal(out, quiet)  # a quarter of the rated power at most, so it passes bit for bit
+    assert first_window_over(np.concatenate([played, out]), 64, rated_power) is None
+
+
 def test_a_window_of_one_sample_is_a_clip() -> None:
     """At sqrt(rho_o), less the margin for rounding, some 1e-15; the gain that goes with it is 0.99 or less."""
     y = limiter(1, 4.0).process([0.5, -1.3, -1000.0, 1e300])
