@@ -121,3 +121,10 @@ def test_a_control_signal_of_the_wrong_size_is_refused() -> None:
         run(Wrong())
     with pytest.raises(TypeError, match="function of a sample"):
         run(amplifier=[1.0, 2.0])
+
+
+@pytest.mark.parametrize("shape", [(200,), (1, 200)])
+def test_signals_of_one_channel_have_the_axes_that_the_reference_has(shape):
+    reference, paths = np.random.default_rng(0).standard_normal(shape), np.array([[[0.0, 0.8]]])
+    result = simulate(FxLMS(8, paths, step_size=1e-3), reference, disturbance=reference, secondary_path=paths)
+    assert {getattr(result, name).shape for name in ("reference", "disturbance", "error", "control_signal")} == {shape}
