@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import importlib.resources
+import inspect
 import json
 import re
 import subprocess
@@ -87,8 +88,11 @@ def test_public_names_resolve_and_are_listed_once(namespace):
     assert module.__all__
     assert len(set(module.__all__)) == len(module.__all__)
     for name in module.__all__:
-        assert getattr(module, name) is not None
+        thing = getattr(module, name)
+        assert thing is not None
         assert name in dir(module)
+        hides = Path(module.__file__).with_name(f"{name}.py").exists() and not inspect.ismodule(thing)
+        assert not hides, f"importing {name}.py would put the module in place of the name"
 
 
 def test_unknown_name_raises_attribute_error():

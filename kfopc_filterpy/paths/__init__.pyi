@@ -8,8 +8,8 @@ from .analysis import secondary_path_gain as secondary_path_gain
 from .duct import Duct as Duct
 from .duct import DuctPaths as DuctPaths
 from .duct import duct_paths as duct_paths
-from .feedback_margin import FeedbackMargin as FeedbackMargin
-from .feedback_margin import feedback_margin as feedback_margin
+from .feedback_stability import FeedbackMargin as FeedbackMargin
+from .feedback_stability import feedback_margin as feedback_margin
 from .identification import IdentificationResult as IdentificationResult
 from .identification import PathEstimate as PathEstimate
 from .identification import estimate_path as estimate_path
