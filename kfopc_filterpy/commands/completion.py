@@ -6,8 +6,8 @@ import argparse
 from collections.abc import Iterator
 from functools import partial
 
+from .._validate import how_to_install
 from .options import DONE, Parser, add_command
-from .printing import EXTRA
 
 EXAMPLES = """examples:
   kfopc completion bash > ~/.local/share/bash-completion/completions/kfopc
@@ -28,7 +28,7 @@ def completion(whole: Parser, options: argparse.Namespace) -> int:
     try:
         import shtab
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"completion needs shtab: {EXTRA}") from error
+        raise ModuleNotFoundError(f"completion needs shtab: {how_to_install('studies')}") from error
     for action in _actions(whole):
         name = action.metavar or action.dest
         if name in FILES + FOLDERS:

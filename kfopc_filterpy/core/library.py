@@ -22,11 +22,24 @@ VISITOR = ctypes.PYFUNCTYPE(
 # 32 and 64 bits, N a size, r a number of the core, V a visitor.
 _TYPES = {"-": None, "P": ctypes.c_void_p, "i": ctypes.c_int32, "q": ctypes.c_int64, "N": ctypes.c_size_t, "V": VISITOR}
 _CALLS = {
-    **{"size": "NPP", "open": "iPPPPNi", "describe": "-PPVP", "refilter": "-P", "listen": "qPPPPPqP"},
-    **{"run": "qPPPPiqqP", "hear": "-PPq", "play": "-PPPq", "process": "qPiiiPPPPqqqPP"},
-    **{"preview": "-PPPiPrrr", "commit": "-PPPiPrrr", "limit": "rPPr", "limit_all": "-PPPPq", "amplify_all": "-PPPq"},
-    **{"covariance_size": "Ni", "covariance_describe": "-iVP"},
-    **{"covariance_predict": "-Pirr", "covariance_update": "iPiPPrrP"},
+    "size": "NPP",
+    "open": "iPPPPNi",
+    "describe": "-PPVP",
+    "refilter": "-P",
+    "listen": "qPPPPPqP",
+    "run": "qPPPPiqqP",
+    "hear": "-PPq",
+    "play": "-PPPq",
+    "process": "qPiiiPPPPqqqPP",
+    "preview": "-PPPiPrrr",
+    "commit": "-PPPiPrrr",
+    "limit": "rPPr",
+    "limit_all": "-PPPPq",
+    "amplify_all": "-PPPq",
+    "covariance_size": "Ni",
+    "covariance_describe": "-iVP",
+    "covariance_predict": "-Pirr",
+    "covariance_update": "iPiPPrrP",
 }
 
 
