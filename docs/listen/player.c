@@ -61,7 +61,7 @@ int EXPORTED(player_open)(int which, int taps, int n_primary, int n_secondary, r
     const anc_plan plan = {.scenarios = 1, .microphones = 1, .loudspeakers = 1, .references = 1, .taps = taps,
                            .path_taps = n_secondary, .path = secondary, .settings = settings};
     chosen = which;
-    controller = (anc_controller){NULL, silent, deaf};
+    controller = (anc_controller){NULL, silent, deaf, NULL};
     if (which != OFF) {
         const anc_algorithm *algorithm = algorithm_of(which);
         const size_t bytes = anc_size(algorithm, &plan);
@@ -72,7 +72,7 @@ int EXPORTED(player_open)(int which, int taps, int n_primary, int n_secondary, r
             *((signals *)&view)->constraint = (anc_constraint){.rated_power = rated, .rate = rate, .supplied_factor = (real)NAN,
                 .supplied_power = (real)NAN, .supplied_gain = (real)NAN, .factor = 1, .gain = (real)NAN};
         controller = (anc_controller){&view, (int (*)(void *, const real *, real *))(void *)algorithm->control_signal,
-                                      (int (*)(void *, const real *))(void *)algorithm->update};
+                                      (int (*)(void *, const real *))(void *)algorithm->update, NULL};
     }
     if (afresh || plant.path_taps != n_secondary || primary_taps != n_primary) {
         memset(heard, 0, sizeof heard), memset(played, 0, sizeof played);
@@ -108,7 +108,7 @@ void EXPORTED(player_run)(int n)
         k = anc_run(&controller, &plant, &s, NULL, 0, k, n, &status);
         if (k < n) {
             sums[STATUS] = (real)status;
-            controller = (anc_controller){NULL, silent, deaf};
+            controller = (anc_controller){NULL, silent, deaf, NULL};
             k += status == ANC_REFUSED_ERROR; /* it was played */
             status = ANC_RUNNING;
         }

@@ -10,7 +10,7 @@ from .._validate import as_count, as_number
 from ..paths.path_matrix import is_path_matrix, secondary_paths, single_path
 from .base import require_rates
 from .channel_samples import channel_sample
-from .processing import block_signal, require_channels
+from .processing import block_signal, require_channels, takes_none
 
 
 class Channels:
@@ -45,6 +45,8 @@ class Channels:
 
     def _sample(self, value: Any, name: str, what: str) -> Any:
         """Return a checked sample: a number, or with several channels an array of them; `what` names the channels."""
+        if what == "references" and takes_none(self, value):
+            return np.empty(0)
         if self.multichannel:
             return channel_sample(value, getattr(self, f"n_{what}"), name, what)
         return as_number(value, name)

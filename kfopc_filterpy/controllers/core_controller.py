@@ -28,6 +28,7 @@ from .processing import (
     output_array,
     require_apart,
     require_one_length,
+    takes_none,
 )
 
 NO_SOLUTION = "the update has no solution: the covariance P is too large, S = x' P x' + q could overflow"
@@ -98,6 +99,8 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         must be positive. An attribute of the class.
     needs_rated_power : bool
         Whether a rated power or a constraint must be given. An attribute of the class.
+    internal_model : bool
+        Whether the last references come from an internal model, see `with_internal_model`; `n_references` are the others.
 
     Raises
     ------
@@ -128,6 +131,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     checks: ClassVar[Mapping[str, Callable[[Any, str], float]]] = {}  # of settings that need not be positive
     needs_rated_power: ClassVar[bool] = False  # or a constraint
     takes_guard: ClassVar[bool] = True  # whether the step takes account of an uncertain secondary path
+    internal_model: bool = False
     _block: Block | None = None
     _uncertainty: Any = None  # as it was assigned
 
@@ -241,13 +245,28 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         return Shape(
             self.n_microphones,
             self.n_loudspeakers,
-            self.n_references,
+            self.n_references + self.internal_model * self.n_microphones,
             self.n_taps,
             path_taps,
             guard_taps,
             tuple(one.state.window.shape[1] for one in self._each(self._own_constraint)),
             tuple(one.state.laps.shape[1] - 1 for one in self._each(self._limiter)),
+            modelled=int(self.internal_model),
         )
+
+    def _remake_block(self) -> None:
+        """Go on in a block for the limiter and the internal model that are now in use."""
+        block = self._opened()
+        guard = block.fields["guard"].ravel()
+        shape = self._needed_shape(block.shape.path_taps, guard.size)
+        self._use_block(block.remade(shape, guard if guard.size else None))
+
+    def _add_internal_model(self) -> None:
+        """Let the internal model take the place of the last references."""
+        self.name = f"{'hybrid' if self.n_references > self.n_microphones else 'feedback'} {self.name}"
+        self.n_references -= self.n_microphones
+        self.internal_model = True
+        self._remake_block()
 
     @staticmethod
     def _each(value: Any) -> tuple[Any, ...]:
@@ -308,10 +327,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
                 limiter.move_out()
             for new, old in zip(self._each(self._limiter), self._each(before), strict=False):
                 new.follow(old)
-            guard = block.fields["guard"].ravel()
-            self._use_block(
-                block.remade(self._needed_shape(block.shape.path_taps, guard.size), guard if guard.size else None)
-            )
+            self._remake_block()
 
     @property
     def secondary_path(self) -> np.ndarray:
@@ -469,10 +485,10 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
     # Samples.
 
-    def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
+    def control_signal(self, reference: NumberOrArray | None) -> NumberOrArray:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample.
 
-        With several channels, x(n) is (I,) and y(n) is (J,).
+        With several channels, x(n) is (I,) and y(n) is (J,). A feedback controller has no reference microphone: None.
         """
         block, x = self._opened(), self._sample(reference, "reference", "references")
         block.enter()
@@ -486,29 +502,40 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
     def update(self, error: NumberOrArray) -> None:
         """Adapt to the error e(n), with several channels (K,), that the last control signal left."""
+        self._take(error, "update")
+
+    def take_error(self, error: NumberOrArray) -> None:
+        """Take an error without adapting to it, in place of `update`: an internal model needs it for its reference."""
+        self._take(error, "take_error")
+
+    def _take(self, error: Any, step: str) -> None:
+        """Hand an error to a step of the core, "update" or "take_error"."""
         block, e = self._opened(), self._sample(error, "error", "microphones")
         block.enter()
         try:
             block.error[:] = e
-            if answer := block.update():
+            if answer := getattr(block, step)():
                 raise ValueError(f"{reason_of(answer)}; nothing was changed")
         finally:
             block.leave()
 
     def process(
-        self, references: ArrayLike, errors: ArrayLike, *, adapt: bool | ArrayLike = True, out: np.ndarray | None = None
+        self, references: ArrayLike | None, errors: ArrayLike, *, adapt: bool | ArrayLike = True, out: np.ndarray | None = None
     ) -> np.ndarray:
         """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
         looped = self.looped()
         if looped is None:
             return super().process(references, errors, adapt=adapt, out=out)
-        x = self._block_signal(references, "references", self.n_references)
         e = self._block_signal(errors, "errors", self.n_microphones)
+        if takes_none(self, references):
+            x = np.empty((0, e.shape[-1]))
+        else:
+            x = self._block_signal(references, "references", self.n_references)
         require_one_length(x, e)
         n_samples = x.shape[-1]
         flags = adapt_flags(adapt, n_samples)
         require_apart(out, x, e)
-        y = output_array(out, (self.n_loudspeakers, n_samples) if self.multichannel else x.shape)
+        y = output_array(out, (self.n_loudspeakers, n_samples) if self.multichannel else e.shape)
         rows = [np.atleast_2d(signal) for signal in (x, e, y)]
         done = 0
         with self.in_use:
@@ -529,13 +556,13 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
             raise RefusedUpdate(str(reason), sample) from reason
         raise RefusedUpdate(NO_SOLUTION, sample)
 
-    def listen(self, references: np.ndarray, errors: np.ndarray, *, adapt: bool | ArrayLike = True) -> None:
+    def listen(self, references: np.ndarray | None, errors: np.ndarray, *, adapt: bool | ArrayLike = True) -> None:
         """Follow the noise before the control is switched on: delay lines and powers advance, the weights stay.
 
         Parameters
         ----------
-        references : ndarray, shape (n_samples,) or (I, n_samples)
-            Reference.
+        references : ndarray, shape (n_samples,) or (I, n_samples), or None
+            Reference; None for a feedback controller, which has none.
         errors : ndarray, shape (n_samples,) or (K, n_samples)
             Signals of the error microphones while the loudspeakers are silent.
         adapt : bool or ndarray of shape (n_samples,), default True
@@ -544,15 +571,18 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         if self.multichannel:
             x, e = self._channel_signals(references, errors)
         else:
-            x = as_signal(references, "references")
-            e = as_signal(errors, "errors", length=x.size)
+            e = as_signal(errors, "errors")
+            none = takes_none(self, references)
+            x = np.empty((e.size, 0)) if none else as_signal(references, "references", length=e.size)
         taken = self._listen(x, e, adapt_flags(adapt, len(x)))
         if taken < len(x):
             raise refused_while_listening(OVERFLOW, taken)
 
     def _channel_signals(self, references: Any, errors: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return references and errors with a sample in each row."""
-        x, e = np.atleast_2d(as_channels(references, "references")), np.atleast_2d(as_channels(errors, "errors"))
+        e = np.atleast_2d(as_channels(errors, "errors"))
+        none = takes_none(self, references)
+        x = np.empty((0, e.shape[1])) if none else np.atleast_2d(as_channels(references, "references"))
         if (len(x), len(e)) != (self.n_references, self.n_microphones) or x.shape[1] != e.shape[1]:
             raise ValueError(
                 f"references must be (I, n_samples) and errors (K microphones, n_samples) with I = {self.n_references}, "

@@ -119,7 +119,7 @@ class KalmanController(CoreController):
         if variance > 0.0:
             self.estimator.P = self.estimator.P + variance * np.eye(self.n_taps)
 
-    def control_signal(self, reference: float) -> float:
+    def control_signal(self, reference: float | None) -> float:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
         weights = self._by_channel("weights")
         before = weights.copy()
@@ -150,7 +150,12 @@ class KalmanController(CoreController):
             powers.advance(d, h[0, 0], x)
 
     def process(
-        self, references: ArrayLike, errors: ArrayLike, *, adapt: bool | ArrayLike = True, out: np.ndarray | None = None
+        self,
+        references: ArrayLike | None,
+        errors: ArrayLike,
+        *,
+        adapt: bool | ArrayLike = True,
+        out: np.ndarray | None = None,
     ) -> np.ndarray:
         """Process a block, see `BlockProcessing.process`; to the estimator, a sample that is not adapted to is missed."""
         y = super().process(references, errors, adapt=adapt, out=out)
@@ -162,13 +167,14 @@ class KalmanController(CoreController):
         if self.constraint is self._own_constraint:
             return super()._listen(references, errors, adapting)
         block = self._opened()
-        for n, (x, e) in enumerate(zip(references, errors, strict=True)):
+        for n, e in enumerate(errors):
             taken = super()._listen(references[n : n + 1], errors[n : n + 1], adapting[n : n + 1])
             if not taken:
                 return n
             if adapting[n]:
                 filtered = float(block.latest("filtered_reference").flat[0])
-                self.constraint.advance(float(e), filtered, float(x))  # silent: d^ = e
+                reference = float(block.latest("reference").flat[0])
+                self.constraint.advance(float(e), filtered, reference)  # silent: d^ = e
         return len(references)
 
 

@@ -33,7 +33,12 @@ class BlockProcessing:
     """Gives a controller `process`, by its two methods per sample."""
 
     def process(
-        self, references: ArrayLike, errors: ArrayLike, *, adapt: bool | ArrayLike = True, out: np.ndarray | None = None
+        self,
+        references: ArrayLike | None,
+        errors: ArrayLike,
+        *,
+        adapt: bool | ArrayLike = True,
+        out: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the control signals of a block of samples, and adapt to its errors.
 
@@ -44,8 +49,8 @@ class BlockProcessing:
 
         Parameters
         ----------
-        references : array_like, shape (n_samples,) or (I, n_samples)
-            Reference x.
+        references : array_like, shape (n_samples,) or (I, n_samples), or None
+            Reference x; None for a controller without a reference microphone, see `with_internal_model`.
         errors : array_like, shape (n_samples,) or (K, n_samples)
             Error e.
         adapt : bool or array_like, shape (n_samples,), default True
@@ -88,31 +93,55 @@ class BlockProcessing:
 
 
 def process_steps(
-    controller: Any, references: ArrayLike, errors: ArrayLike, *, adapt: bool | ArrayLike, out: np.ndarray | None
+    controller: Any,
+    references: ArrayLike | None,
+    errors: ArrayLike,
+    *,
+    adapt: bool | ArrayLike,
+    out: np.ndarray | None,
 ) -> np.ndarray:
     """Do what `BlockProcessing.process` says for any controller, by its two methods per sample."""
-    x, e = block_signal(references, "references"), block_signal(errors, "errors")
+    e, none = block_signal(errors, "errors"), takes_none(controller, references)
+    x = np.empty((0, e.shape[-1])) if references is None else block_signal(references, "references")
     require_one_length(x, e)
     flags = adapt_flags(adapt, x.shape[-1])
     require_apart(out, x, e)
     y: Any = out
     # The channels of others show in the first sample: of a user's controller, and of one with virtual microphones.
     if hasattr(controller, "multichannel") and not hasattr(controller, "physical"):
-        require_channels(x, "references", controller.multichannel, controller.n_references)
+        if not none:
+            require_channels(x, "references", controller.multichannel, controller.n_references)
         require_channels(e, "errors", controller.multichannel, controller.n_microphones)
         y = output_array(out, ((controller.n_loudspeakers,) if controller.multichannel else ()) + x.shape[-1:])
     with getattr(controller, "in_use", nullcontext()):
         for n in range(x.shape[-1]):
-            sample = controller.control_signal(x[..., n])
+            sample = controller.control_signal(None if none else x[..., n])
             if n == 0:
                 y = output_array(y, (*np.shape(sample), x.shape[-1]))
             y[..., n] = sample
-            if flags[n]:
+            if flags[n] or getattr(controller, "internal_model", False):
                 try:
-                    controller.update(e[..., n])
+                    (controller.update if flags[n] else controller.take_error)(e[..., n])
                 except ValueError as error:
                     raise RefusedUpdate(str(error), n) from error
     return y
+
+
+def takes_none(controller: object, references: object) -> bool:
+    """Return whether a controller takes no references; raise ValueError if it does and has some, or needs them."""
+    none = getattr(controller, "n_references", 1) == 0
+    given: Any = references
+    if none and references is not None and np.size(given):
+        raise ValueError(
+            "reference must be None: this controller has no reference microphone, its reference is its own estimate of "
+            "the disturbance"
+        )
+    if not none and references is None:
+        raise ValueError(
+            "reference must be the signal of the reference microphone, got None: without one, make a feedback controller "
+            "with controllers.with_internal_model"
+        )
+    return none
 
 
 def block_signal(value: ArrayLike, name: str) -> np.ndarray:

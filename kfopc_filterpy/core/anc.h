@@ -38,6 +38,8 @@ typedef struct {
     int32_t scenarios, microphones, loudspeakers, references, taps, path_taps; /* S, K, J, I, L, M */
     int32_t guard_taps;             /* G; 0: the secondary paths are exact */
     int32_t limited;                /* 1: with limiters, which are silent until the host sets their numbers */
+    int32_t modelled;               /* 1: the last K of the references are d^ of the sample before, which the host does not
+                                     * give (internal model); one scenario */
     const int32_t *power_windows;   /* (S, J) samples of the window of the powers; 0: exponential. NULL: all 0 */
     const int32_t *limiter_windows; /* (S, J) samples of each limiter's window; NULL without limiters */
     const anc_real *path;           /* (K, J, M) estimated secondary paths */
@@ -93,6 +95,8 @@ ANC_PUBLIC int anc_open(const anc_algorithm *algorithm, const anc_plan *plan, an
 ANC_PUBLIC void anc_describe(const anc_algorithm *algorithm, const anc_plan *plan, anc_visitor *visit, void *to);
 /* Filter the stored references again, after the paths or the guard in the block have changed. */
 ANC_PUBLIC void anc_refilter(anc_view *view);
+/* Take an error that is not adapted to: an internal model needs it for its next reference. `update` takes its own. */
+ANC_PUBLIC int anc_take_error(anc_view *view, const anc_real *error);
 /* Follow x, (n, I), and e, (n, S, K), while the loudspeakers are silent: the delay lines advance, and so do the powers
  * where `adapt` is 1; the weights stay, unless the algorithm has a `listen` of its own. Return the number of samples
  * before a refused one, and set `answer` to its answer. */
@@ -151,6 +155,7 @@ typedef struct { /* a controller as the loop sees it: of the core or of the host
     void *self;
     int (*control_signal)(void *self, const anc_real *reference, anc_real *control);
     int (*update)(void *self, const anc_real *error);
+    int (*take_error)(void *self, const anc_real *error); /* one that is not adapted to; NULL: it is not needed */
 } anc_controller;
 
 typedef struct {

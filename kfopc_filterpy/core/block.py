@@ -45,7 +45,7 @@ class _Plan(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_int32) for name in ("scenarios", "microphones", "loudspeakers", "references")),
         *((name, ctypes.c_int32) for name in ("taps", "path_taps")),
-        *((name, ctypes.c_int32) for name in ("guard_taps", "limited")),
+        *((name, ctypes.c_int32) for name in ("guard_taps", "limited", "modelled")),
         *((name, ctypes.c_void_p) for name in ("power_windows", "limiter_windows", "path", "guard", "settings")),
     ]
 
@@ -108,9 +108,10 @@ class Algorithm:
             self.settings.append(Setting(name_of.decode(), _EACH[self._struct.settings[len(self.settings)].each]))
 
     @property
-    def steps(self) -> tuple[int, int]:
-        """Addresses of the functions `control_signal` and `update`."""
-        return self._struct.control_signal, self._struct.update
+    def steps(self) -> tuple[int, int, int]:
+        """Addresses of the functions `control_signal`, `update` and `anc_take_error`."""
+        take_error = ctypes.cast(self.library.held.anc_take_error, ctypes.c_void_p).value
+        return self._struct.control_signal, self._struct.update, take_error or 0
 
     def shapes(self, shape: Shape) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the fields of a block, by name."""
@@ -138,6 +139,7 @@ class Shape:
     power_windows: tuple[int, ...] = ()  # of every loudspeaker of every scenario
     limiter_windows: tuple[int, ...] = ()
     scenarios: int = 1
+    modelled: int = 0  # 1: the last of the references, one for each microphone, come from the internal model
 
     def count(self, each: str) -> int:
         """Return the number of "loudspeakers" or "microphones", 1 for ""."""
@@ -237,12 +239,13 @@ class Block:
             self.fields[name] = np.frombuffer(self.memory, dtype, int(np.prod(axes)), offset).reshape(axes)
             names[role].append(name)
         self.states, self.scratch = names[_STATE], names[_SCRATCH]
-        counts = (shape.references, shape.scenarios * shape.loudspeakers, shape.scenarios * shape.microphones)
+        given = shape.references - shape.modelled * shape.microphones
+        counts = (given, shape.scenarios * shape.loudspeakers, shape.scenarios * shape.microphones)
         self.reference, self.control_signal, self.error = (np.zeros(n, algorithm.precision) for n in counts)
-        control, update = algorithm.steps
+        control, update, take_error = algorithm.steps
         pointers = (ctypes.c_void_p,) * 3
         self._control = _step(ctypes.c_int, *pointers)(control)
-        self._update = _step(ctypes.c_int, *pointers[:2])(update)
+        self._update, self._take_error = (_step(ctypes.c_int, *pointers[:2])(one) for one in (update, take_error))
         x, y, e = (array.ctypes.data for array in (self.reference, self.control_signal, self.error))
         self._emitted, self._updated = (self.address, x, y), (self.address, e)
 
@@ -330,6 +333,10 @@ class Block:
     def update(self) -> int:
         """Adapt to `error` and return the answer, 0 if all is well; enter `in_use` before."""
         return self._update(*self._updated)
+
+    def take_error(self) -> int:
+        """Take `error` without adapting to it, and return the answer, 0 if all is well; enter `in_use` before."""
+        return self._take_error(*self._updated)
 
     def listen(
         self, references: NDArray[np.float64], errors: NDArray[np.float64], adapting: NDArray[np.bool_]

@@ -504,6 +504,8 @@ static int note(budget *f, const real *error, int controlled)
         if (!within(*newest(&s->y, j), LOUDEST_PLAYED) || !within(f->asked[j], LOUDEST_PLAYED)) return ANC_LOUD_REFERENCE;
     for (int32_t k = 0; error && k < s->K; k++)
         if (!within(error[k], LOUDEST_LEARNT)) return ANC_LOUD_ERROR;
+    const int refused = error ? anc_take_error((anc_view *)f, error) : ANC_DONE;
+    if (refused) return refused;
     for (int32_t i = 0; i < s->I; i++) *place_of(&f->plant, i) = *newest(&s->x, i);
     for (int32_t j = 0; j < s->J; j++) {
         *place_of(&f->plant, s->I + j) = *newest(&s->y, j);

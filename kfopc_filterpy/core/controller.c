@@ -28,6 +28,7 @@ static int shape_accepted(const anc_plan *p)
     const double S = p->scenarios;
     for (int i = 0; i < 6; i++)
         if (shape[i] < 1 || shape[i] > most) return 0;
+    if (p->modelled && (p->scenarios != 1 || p->references < p->microphones)) return 0;
     if (p->guard_taps < 0 || p->guard_taps > ANC_GUARD_TAPS || (p->limited && !p->limiter_windows)) return 0;
     if (S * J * I * L > most || S * K > most || S * J * (4 * M + 64) > most) return 0;
     for (int32_t sj = 0; sj < p->scenarios * p->loudspeakers; sj++) {

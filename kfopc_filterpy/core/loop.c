@@ -78,6 +78,7 @@ int64_t anc_process(const anc_controller *c, int32_t references, int32_t loudspe
         if (c->control_signal(c->self, reference, control)) return n;
         *status = ANC_REFUSED_ERROR;
         for (int32_t j = 0; j < loudspeakers; j++) y[j * length + n] = control[j];
+        if (!adapt[n] && c->take_error && c->take_error(c->self, error)) return n;
         if (c->update(c->self, adapt[n] ? error : NULL)) return n;
     }
     *status = ANC_RUNNING;

@@ -20,12 +20,13 @@ class Steps(NamedTuple):
     """A controller as the loop sees it: `anc_controller` in anc.h."""
 
     address: int  # of the controller, which must exist for as long as the loop runs
-    control_signal: int  # addresses of the two functions
+    control_signal: int  # addresses of the functions
     update: int
+    take_error: int = 0  # of an error that is not adapted to; 0: it is not needed
 
 
 class _Controller(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in ("self", "control_signal", "update")]
+    _fields_ = [(name, ctypes.c_void_p) for name in ("self", "control_signal", "update", "take_error")]
 
 
 class _Plant(ctypes.Structure):

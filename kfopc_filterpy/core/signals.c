@@ -53,7 +53,7 @@ static void layout_all(signals *s, const anc_plan *p, const anc_setting *setting
     const int32_t L = p->taps, M = p->path_taps, G = p->guard_taps;
     const int32_t filtered = L < ANC_GUARD_TAPS ? ANC_GUARD_TAPS : L + 1; /* for a later guard; for a fast array */
     s->S = S, s->K = K, s->J = J, s->I = I, s->L = L, s->M = M, s->G = G;
-    s->limited = p->limited;
+    s->limited = p->limited, s->modelled = p->modelled ? K : 0;
     s->power_length = longest(p->power_windows, S * J), s->limiter_length = longest(p->limiter_windows, S * J);
     s->path = reals(at, "secondary_path", ANC_SETTING, 1, K, J, M);
     s->guard = reals(at, "guard", ANC_SETTING, 1, 1, 1, G);
@@ -64,6 +64,7 @@ static void layout_all(signals *s, const anc_plan *p, const anc_setting *setting
     s->filtered = layout_lines(at, "filtered_reference", "filtered_reference_at", with_filtered ? K : 0, J, I, filtered);
     s->guarded = layout_lines(at, "guarded_reference", "guarded_reference_at", G ? K : 0, J, I, L);
     s->y = layout_lines(at, "output", "output_at", 1, S, J, M);
+    s->internal = reals(at, "internal_reference", ANC_STATE, 1, 1, 1, s->modelled);
     s->weights = reals(at, "weights", ANC_STATE, S, J, I, L);
     s->control = reals(at, "control_signal", ANC_STATE, 1, 1, S, J);
     s->constraint = (anc_constraint *)reals(at, "constraint", ANC_STATE, 1, S, J, COLUMNS(anc_constraint));
@@ -75,6 +76,7 @@ static void layout_all(signals *s, const anc_plan *p, const anc_setting *setting
     s->previewed = (anc_previewed *)reals(at, "previewed", ANC_SCRATCH, 1, S, J, COLUMNS(anc_previewed));
     s->estimate = reals(at, "disturbance", ANC_SCRATCH, 1, 1, S, K);
     s->heard = reals(at, "heard", ANC_SCRATCH, 1, 1, S, K);
+    s->modelling = reals(at, "modelling", ANC_SCRATCH, 1, 1, 1, s->modelled);
     s->squares = reals(at, "squares", ANC_SCRATCH, 1, S, J, ANC_POWERS);
     s->step = reals(at, "step", ANC_SCRATCH, 1, S, J, STEPS);
 }
@@ -82,7 +84,8 @@ static void layout_all(signals *s, const anc_plan *p, const anc_setting *setting
 void layout_signals(signals *s, const anc_plan *p, const anc_setting *settings, anc_layout *at) { layout_all(s, p, settings, at, 1); }
 void layout_unfiltered(signals *s, const anc_plan *p, const anc_setting *settings, anc_layout *at) { layout_all(s, p, settings, at, 0); }
 
-/* Set the loudest reference, so that nothing that is filtered from it overflows. */
+/* Set the loudest reference, so that nothing that is filtered from it overflows. What an internal model takes can be learned
+ * from, too: it is not refused later. */
 static void set_loudest(signals *s)
 {
     real reach = 1, guard = 1;
@@ -93,6 +96,7 @@ static void set_loudest(signals *s)
     }
     for (int32_t g = 0; g < s->G; g++) guard += (real)fabs(s->guard[g]);
     *s->loudest = s->filtered.rows ? LOUDEST_REFERENCE / reach / guard : LOUDEST;
+    if (s->modelled && *s->loudest > LOUDEST_LEARNT) *s->loudest = LOUDEST_LEARNT;
 }
 
 void start_signals(signals *s, const anc_plan *p, const anc_setting *settings)
@@ -127,13 +131,20 @@ static void advance(lines *l)
         memcpy(newest(l, row) + 1, l->room + times(row, l->length), sizeof(real) * (size_t)(l->taps - 1));
 }
 
+real reference_of(const signals *s, const real *reference, int32_t i)
+{
+    const int32_t given = s->I - s->modelled;
+    return i < given ? reference[i] : s->internal[i - given];
+}
+
 int take_reference(signals *s, const real *reference)
 {
     for (int32_t i = 0; i < s->I; i++)
-        if (!within(reference[i], *s->loudest)) return ANC_LOUD_REFERENCE;
+        if (!within(reference_of(s, reference, i), *s->loudest)) return ANC_LOUD_REFERENCE;
     advance(&s->x), advance(&s->filtered);
     if (s->G) advance(&s->guarded);
-    for (int32_t i = 0; i < s->I; i++) *newest(&s->x, i) = reference[i];
+    for (int32_t i = 0; i < s->I; i++) *newest(&s->x, i) = reference_of(s, reference, i);
+    for (int32_t k = 0; k < s->modelled; k++) s->internal[k] = 0;
     for (int32_t kj = 0; s->filtered.rows && kj < s->K * s->J; kj++)
         for (int32_t i = 0; i < s->I; i++) {
             const int32_t row = kj * s->I + i;
@@ -181,19 +192,41 @@ real energy_of(const signals *s, const lines *rows, int32_t first, int32_t count
     return sum;
 }
 
+/* Set d^_k = e_k + sum_j s^_kj * y_j of a microphone of a scenario. */
+static int estimate_at(const signals *s, const real *error, int32_t scenario, int32_t k, real *estimated)
+{
+    real d = error[scenario * s->K + k];
+    if (!within(d, LOUDEST)) return ANC_LOUD_ERROR;
+    for (int32_t j = 0; j < s->J; j++) d += dot(s->path + times(k * s->J + j, s->M), newest(&s->y, scenario * s->J + j), s->M);
+    *estimated = d;
+    return within(d, s->modelled ? *s->loudest : LOUDEST) ? ANC_DONE : ANC_LOUD_ESTIMATE;
+}
+
+static void keep_modelled(signals *s)
+{
+    for (int32_t k = 0; k < s->modelled; k++) s->internal[k] = s->modelling[k];
+}
+
+int anc_take_error(anc_view *view, const real *error)
+{
+    signals *s = (signals *)view;
+    int refused = ANC_DONE;
+    for (int32_t k = 0; !refused && k < s->modelled; k++) refused = estimate_at(s, error, 0, k, s->modelling + k);
+    if (!refused) keep_modelled(s);
+    return refused;
+}
+
 int estimate_disturbance(signals *s, const real *error)
 {
     real x2 = 0;
     for (int32_t i = 0; i < s->I; i++) x2 += *newest(&s->x, i) * *newest(&s->x, i);
     for (int32_t scenario = 0; scenario < s->S; scenario++) {
-        const real *e = error + scenario * s->K;
         real *estimates = s->estimate + scenario * s->K, d2 = 0;
         for (int32_t k = 0; k < s->K; k++) {
-            real d = e[k];
-            if (!within(d, LOUDEST)) return ANC_LOUD_ERROR;
-            for (int32_t j = 0; j < s->J; j++) d += dot(s->path + times(k * s->J + j, s->M), newest(&s->y, scenario * s->J + j), s->M);
-            if (!within(d, LOUDEST)) return ANC_LOUD_ESTIMATE;
-            estimates[k] = d, d2 += d * d;
+            const int refused = estimate_at(s, error, scenario, k, estimates + k);
+            if (refused) return refused;
+            d2 += estimates[k] * estimates[k];
+            if (s->modelled) s->modelling[k] = estimates[k];
         }
         /* Squares of d^ are summed over microphones, of x over references, of x'_j over both. */
         for (int32_t j = 0; j < s->J; j++) {
@@ -240,6 +273,7 @@ real least_factor(const signals *s, int32_t scenario)
 
 void commit(signals *s)
 {
+    keep_modelled(s);
     for (int32_t sj = 0; sj < s->S * s->J; sj++) {
         const real *squares = s->squares + ANC_POWERS * sj;
         anc_commit(s->constraint + sj, s->powers + ANC_POWERS * sj, window_of(s, sj), s->power_windows[sj], s->previewed + sj,
@@ -315,6 +349,7 @@ int64_t anc_listen(const anc_algorithm *a, anc_view *view, const real *x, const 
         if ((*answer = take_reference(s, x + t * s->I))) return t;
         for (int32_t sj = 0; sj < s->S * s->J; sj++) emit(s, sj, 0);
         if ((*answer = a->listen ? a->listen(view, error) : error ? follow(s, error) : ANC_DONE)) return t;
+        if (!error && (*answer = anc_take_error(view, e + t * s->K))) return t;
     }
     return n;
 }
@@ -340,6 +375,11 @@ void anc_refilter(anc_view *view)
 
 static const anc_setting none[] = {{0}};
 
-static int update_estimate(anc_view *view, const real *error) { return error ? estimate((signals *)view, error) : ANC_DONE; }
+static int update_estimate(anc_view *view, const real *error)
+{
+    const int refused = error ? estimate((signals *)view, error) : ANC_DONE;
+    if (error && !refused) keep_modelled((signals *)view);
+    return refused;
+}
 
 const anc_algorithm anc_signals_alone = {"signals alone", none, layout_plain, start_plain, filtered_signal, update_estimate, NULL};

@@ -200,6 +200,10 @@ def _blocks_that_share(controllers: list[Any], fs: float) -> list[Block]:
                 f"controllers[{i}] has steps of its own in Python: scenarios share the gains of kf_anc, kf_opc and "
                 "others whose steps are in the core"
             )
+        if controller.internal_model:
+            raise ValueError(
+                f"controllers[{i}] has an internal model, whose reference differs from scenario to scenario: use simulate"
+            )
         if isinstance(controller, PowerBudgetController):
             raise ValueError(
                 f"controllers[{i}], {controller.name}, learns the plant, which differs from scenario to scenario: use simulate"

@@ -80,7 +80,8 @@ def simulate(
     controller : Controller
         Controller. It continues from its present state, while the paths start silent: make a new one for a fresh run.
     reference : array_like
-        (n_samples,) reference x, or (I, n_samples). Signals and paths may be a `Recording`, whose rate must be `fs`.
+        (n_samples,) reference x, or (I, n_samples). Signals and paths may be a `Recording`, whose rate must be `fs`. None
+        for a feedback controller, see `controllers.with_internal_model`.
     secondary_path : array_like or control.TransferFunction
         True secondary path s, loudspeaker amplifier to error microphone. With several channels (K, J, n_taps), or a
         matrix of systems: nested lists, or a system of several inputs and outputs.
@@ -164,6 +165,7 @@ def simulate(
         if isinstance(signal, Recording):
             sampling_rate(signal, fs, name=name)
     several = is_multichannel(controller, reference, secondary_path, disturbance)
+    none = takes_none(controller, reference)
     x, d, secondary = _read_signals(
         reference, noise_level_db, primary_path, disturbance, secondary_path, fs, crossfade_s, several
     )
@@ -183,7 +185,8 @@ def simulate(
     weights = _weight_rows(x.shape[1] - on, controller, every, several)
     if on:
         heard = x[:, :on].copy(), d[:, :on] + noise.take(K, on)
-        listening(controller).listen(*(heard if several else (signal[0] for signal in heard)))
+        signals_heard = heard if several else (signal[0] if len(signal) else None for signal in heard)
+        listening(controller).listen(*signals_heard)
         x, d = x[:, on:], d[:, on:]
 
     plant = Plant(
@@ -224,7 +227,7 @@ def simulate(
     if not hasattr(controller, "power_weight"):
         found.pop("power_weight", None)
     if not several or (np.ndim(reference) == 1 and J == K == 1):  # one channel drops its axis, as it was given
-        x, d, found = x[0], d[0], {name: signal[0] for name, signal in found.items()}
+        x, d, found = x if none else x[0], d[0], {name: signal[0] for name, signal in found.items()}
         rated = None if rated is None else float(np.ravel(rated)[0])
     return SimulationResult(
         algorithm=str(getattr(controller, "name", type(controller).__name__)),
@@ -308,7 +311,9 @@ class _Run:
         return False, x.shape[1]
 
     def _sample(self, values: np.ndarray) -> Any:
-        """Return a sample as the controller takes it: a number, or with several channels an array."""
+        """Return a sample as the controller takes it: a number, with several channels an array, without any None."""
+        if not values.size:
+            return None
         return values.copy() if self.several else float(values[0])
 
     def _control_signal(self, references: np.ndarray) -> np.ndarray:
@@ -371,7 +376,11 @@ def _read_signals(
     several: bool,
 ) -> tuple[np.ndarray, np.ndarray, Schedule]:
     """Return references (I, n), disturbances (K, n) and secondary paths (K, J, taps)."""
-    x = np.atleast_2d(as_channels(reference, "reference") if several else as_signal(reference, "reference"))
+    if reference is None and (disturbance is None or primary_path is not None):
+        raise ValueError("without a reference give disturbance=, not primary_path=: the path would begin at the reference")
+    given = ("disturbance", disturbance) if reference is None else ("reference", reference)
+    signal = np.atleast_2d((as_channels if several else as_signal)(given[1], given[0]))
+    x = signal[:0] if reference is None else signal
     if disturbance is not None and noise_level_db != 0.0:
         raise ValueError(
             "noise_level_db needs primary_path=, by which the disturbance follows; if you give the disturbance, scale "
@@ -388,6 +397,8 @@ def _read_signals(
     if several:
         K = len(secondary.values[0])
         return x, channel_disturbances(x, primary_path, disturbance, fs, K, crossfade_s), secondary
+    if reference is None:
+        return x, signal, secondary
     return x, disturbance_at_microphone(x[0], primary_path, disturbance, fs, crossfade_s)[None], secondary
 
 

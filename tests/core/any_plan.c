@@ -85,7 +85,8 @@ int main(int argc, char **argv)
         const int32_t number = below(known);
         const anc_algorithm *a = algorithms[number].algorithm;
         anc_plan plan = {.scenarios = any_count(MOST), .microphones = any_count(MOST), .loudspeakers = any_count(MOST), .references = any_count(MOST),
-                         .taps = any_count(LONGEST), .path_taps = any_count(LONGEST), .guard_taps = below(2) ? any_count(48) : 0, .limited = below(2)};
+                         .taps = any_count(LONGEST), .path_taps = any_count(LONGEST), .guard_taps = below(2) ? any_count(48) : 0, .limited = below(2),
+                         .modelled = !below(4)};
         const int tidy = below(2); /* so that many plans are not refused */
         int32_t windows[2][MOST * MOST];
         for (int32_t j = 0; j < MOST * MOST; j++) windows[0][j] = below(3) ? any_count(LONGEST) : 0, windows[1][j] = any_count(LONGEST);

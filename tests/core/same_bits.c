@@ -91,7 +91,7 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int equipped)
                        .at = 3 * PATH + 64, .length = 4 * PATH + 64, .path = path, .feedback = feedback, .amplifiers = amplifiers,
                        .output = output, .reference = present, .control = present + MOST, .error = present + 2 * MOST, .limit = limit};
     const anc_signals signals = {SAMPLES, reference[0], disturbance[0], NULL, signal[0], signal[MOST], signal[2 * MOST], signal[3 * MOST]};
-    const anc_controller seen = {&c, control_signal, update};
+    const anc_controller seen = {&c, control_signal, update, NULL};
     int32_t status = ANC_RUNNING;
     hash y = {14695981039346656037u, NULL}, states = y;
     anc_real *value = settings, size = 0.5f;
