@@ -3,6 +3,7 @@ from .core_controller import CoreController as CoreController
 from .core_controller import load_algorithm as load_algorithm
 from .direct import DirectKalman as DirectKalman
 from .feedback import FeedbackNeutralizer as FeedbackNeutralizer
+from .internal_model import with_internal_model as with_internal_model
 from .leaky import leak_factor as leak_factor
 from .mov import penalty_factor as penalty_factor
 from .power_budget import PowerBudgetController as PowerBudgetController

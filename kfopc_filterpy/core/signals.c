@@ -346,7 +346,7 @@ int64_t anc_listen(const anc_algorithm *a, anc_view *view, const real *x, const 
     signals *s = (signals *)view;
     for (int64_t t = 0; t < n; t++) {
         const real *error = adapt[t] ? e + t * s->S * s->K : NULL;
-        if ((*answer = take_reference(s, x + t * s->I))) return t;
+        if ((*answer = take_reference(s, x + t * (s->I - s->modelled)))) return t;
         for (int32_t sj = 0; sj < s->S * s->J; sj++) emit(s, sj, 0);
         if ((*answer = a->listen ? a->listen(view, error) : error ? follow(s, error) : ANC_DONE)) return t;
         if (!error && (*answer = anc_take_error(view, e + t * s->K))) return t;

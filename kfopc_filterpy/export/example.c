@@ -11,14 +11,14 @@ int main(void)
 {
     unsigned long noise = 1;
     int refused = 0;
-    $real x[${NAME}_REFERENCES], e[${NAME}_MICROPHONES], y[${NAME}_LOUDSPEAKERS], loudest = 0;
+    $real x[$room], e[${NAME}_MICROPHONES], y[${NAME}_LOUDSPEAKERS], loudest = 0;
     if (${name}_self_test(&state)) {
         puts("the self-test failed: this compiler, or one of its flags, changes the arithmetic");
         return 1;
     }
     ${name}_init(&state);
     for (int n = 0; n < SAMPLES; n++) {
-        for (int i = 0; i < ${NAME}_REFERENCES; i++) { /* x(n), from the reference microphones */
+        for (int i = 0; i < $room; i++) { /* x(n), from the reference microphones */
             noise = (1103515245UL * noise + 12345UL) & 0x7fffffffUL;
             x[i] = ($real)((long)(noise >> 16) - 16384) / 16384;
         }

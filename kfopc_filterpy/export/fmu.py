@@ -146,7 +146,7 @@ def _model_description(exported: Exported, fs: float, token: str) -> str:
     version = import_module(str(__package__).partition(".")[0]).__version__
     name, number, step, shape = exported.name, NUMBERS[exported.real], repr(1.0 / fs), exported.block.shape
     time = f'<{number} name="time" valueReference="0" causality="independent" variability="continuous"/>'
-    signals = {"reference": shape.references, "error": shape.microphones, "control_signal": shape.loudspeakers}
+    signals = {"reference": exported.n_references, "error": shape.microphones, "control_signal": shape.loudspeakers}
     names = [f"{what}[{i + 1}]" if exported.multichannel else what for what, n in signals.items() for i in range(n)]
     inputs = [(vr, one) for vr, one in enumerate(names, 1) if not one.startswith("control")]
     outputs = [(vr, one, number) for vr, one in enumerate(names, 1) if one.startswith("control")]

@@ -32,6 +32,8 @@ class Float32Controller:
         The controller's.
     rated_power : float, ndarray (J,) or None
         The controller's.
+    n_references : int
+        The controller's.
 
     Raises
     ------
@@ -56,8 +58,9 @@ class Float32Controller:
         self._block = in_precision(exportable(controller), np.dtype(np.float32))
         self._multichannel = controller.multichannel
         self.name, self.rated_power = controller.name, controller.rated_power
+        self.n_references = controller.n_references
 
-    def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
+    def control_signal(self, reference: NumberOrArray | None) -> NumberOrArray:
         """Return the control signal y(n) for the newest reference sample x(n), with several channels (J,) and (I,)."""
         self._block.reference[:] = reference
         self._require(self._block.emit())

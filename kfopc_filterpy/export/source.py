@@ -44,6 +44,11 @@ class Exported:
         return REALS[self.block.algorithm.precision]
 
     @property
+    def n_references(self) -> int:
+        """Number of reference microphones: the internal model gives the other references."""
+        return self.block.reference.size
+
+    @property
     def n_bytes(self) -> int:
         """Size of the state if a pointer has 8 bytes."""
         return self.block.memory.size + (_VIEW_PLACES + 2) * _POINTER
@@ -51,9 +56,11 @@ class Exported:
     def filled(self, template: str, **values: Any) -> str:
         """Return the text of a template; `state` is the address of a state in C, by default that of `state`."""
         s, name, state = self.block.shape, self.name, values.pop("state", "&state")
-        sizes = (s.microphones, s.loudspeakers, s.references, s.taps, s.path_taps, s.guard_taps)
+        sizes = (s.microphones, s.loudspeakers, self.n_references, s.taps, s.path_taps, s.guard_taps)
+        arguments = [state] + ["x" if self.multichannel else "x[0]"] * (self.n_references > 0)
         common: dict[str, Any] = {
             **dict(zip("KJILMG", sizes, strict=True)),
+            "room": max(self.n_references, 1),  # of an array of references
             "description": self.description,
             "source": f"{Path(self.header).stem}.c",
             "header": self.header,
@@ -63,9 +70,9 @@ class Exported:
             "n_bytes": f"{self.n_bytes:,}",
             "flags": FLAGS_OF_AN_EXPORT,
             # The calls of a sample, whose signals are in arrays x, y and e.
-            "control": f"{name}_control_signal({state}, x, y);"
+            "control": f"{name}_control_signal({', '.join([*arguments, 'y'])});"
             if self.multichannel
-            else f"y[0] = {name}_control_signal({state}, x[0]);",
+            else f"y[0] = {name}_control_signal({', '.join(arguments)});",
             "update": f"{name}_update({state}, {'e' if self.multichannel else 'e[0]'})",
         }
         return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(common | values)
@@ -95,13 +102,16 @@ class Exported:
         return {"main.c": self.filled("example.c"), "README.md": page}
 
     def _header(self) -> dict[str, Any]:
-        arrays, name = self.multichannel, self.name
+        arrays, name, x = self.multichannel, self.name, "x, " if self.n_references else ""
+        s = "s" if arrays else ""
         control, update = self._signatures()
         return {
-            "statement": f"{name}_control_signal(&state, x, y);"
+            "statement": f"{name}_control_signal(&state, {x}y);"
             if arrays
-            else f"y = {name}_control_signal(&state, x);",
-            "s": "s" if arrays else "",
+            else f"y = {name}_control_signal(&state{x and ', x'});",
+            "s": s,
+            "x_from": f"x(n) from the reference microphone{s}, " if x else "",
+            "for_x": " for the newest reference sample x(n)" if x else "",
             "returns": "Set `control` to" if arrays else "Return",
             "declared_control": control,
             "declared_update": update,
@@ -129,6 +139,8 @@ class Exported:
         return {
             "constants": "".join(text),
             "windows": windows,
+            "all": shape.references,
+            "modelled": shape.modelled,
             "guard": ".guard = guard, " if fields["guard"].size else "",
             "limited": int(bool(shape.limiter_windows)),
         }
@@ -156,7 +168,7 @@ class Exported:
         block = Block(self.block.algorithm, self.block.shape, memory=self.block.memory)
         outputs = np.empty((self._n_samples(), block.shape.loudspeakers), block.algorithm.precision)
         for n, row in enumerate(outputs):
-            block.reference[:] = [((7 * n + 3 * i) % 17 - 8) / 8 for i in range(block.shape.references)]
+            block.reference[:] = [((7 * n + 3 * i) % 17 - 8) / 8 for i in range(self.n_references)]
             block.error[:] = [((5 * n + 2 * k) % 13 - 6) / 8 for k in range(block.shape.microphones)]
             block.emit()
             row[:] = block.control_signal
@@ -171,21 +183,23 @@ class Exported:
 
     def _signatures(self) -> tuple[str, str]:
         name, real, N = self.name, self.real, self.name.upper()
+        state, heard = f"{name}_state *state", self.n_references > 0
         if self.multichannel:
-            pointers = f"const {real} reference[{N}_REFERENCES], {real} control[{N}_LOUDSPEAKERS]"
-            control = f"void {name}_control_signal({name}_state *state, {pointers})"
+            reference = f"const {real} reference[{N}_REFERENCES], " if heard else ""
+            control = f"void {name}_control_signal({state}, {reference}{real} control[{N}_LOUDSPEAKERS])"
             error = f"const {real} error[{N}_MICROPHONES]"
         else:
-            control = f"{real} {name}_control_signal({name}_state *state, {real} reference)"
+            control = f"{real} {name}_control_signal({state}{f', {real} reference' if heard else ''})"
             error = f"{real} error"
-        return control, f"int {name}_update({name}_state *state, {error})"
+        return control, f"int {name}_update({state}, {error})"
 
     def _calls(self) -> str:
+        reference = ("" if self.multichannel else "&") + "reference" if self.n_references else "NULL"
         if self.multichannel:
-            bodies = "    take(state, reference, control);\n", "    return adapt(state, error);\n"
+            bodies = f"    take(state, {reference}, control);\n", "    return adapt(state, error);\n"
         else:
             bodies = (
-                "    real y;\n    take(state, &reference, &y);\n    return y;\n",
+                f"    real y;\n    take(state, {reference}, &y);\n    return y;\n",
                 "    return adapt(state, &error);\n",
             )
         return "\n".join(f"{head}\n{{\n{body}}}\n" for head, body in zip(self._signatures(), bodies, strict=True))

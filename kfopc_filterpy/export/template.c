@@ -21,8 +21,8 @@ $core
 
 $constants
 static const anc_plan plan = {
-    .scenarios = 1, .microphones = $K, .loudspeakers = $J, .references = $I, .taps = $L, .path_taps = $M, .guard_taps = $G,
-    .limited = $limited, $windows.path = path, $guard.settings = settings,
+    .scenarios = 1, .microphones = $K, .loudspeakers = $J, .references = $all, .taps = $L, .path_taps = $M, .guard_taps = $G,
+    .limited = $limited, .modelled = $modelled, $windows.path = path, $guard.settings = settings,
 };
 
 /* The state of the export: where it differs from a fresh block, `count` elements of a field from `first` on. */
@@ -69,7 +69,7 @@ static anc_view *view_of(${name}_state *state)
 /* Set y for x. Time goes on where x is refused: it counts as silence. */
 static void take(${name}_state *state, const real *x, real *y)
 {
-    static const real silence[$I];
+    static const real silence[$room];
     for (int32_t j = 0; j < $J; j++) y[j] = 0;
     if (!usable(state)) return;
     anc_view *view = view_of(state);
@@ -105,7 +105,7 @@ int ${name}_self_test(${name}_state *state)
     int differ = !usable(state);
     ${name}_init(state);
     for (int32_t n = 0; n < SELF_TEST; n++) {
-        real x[$I], e[$K], y[$J];
+        real x[$room] = {0}, e[$K], y[$J];
         for (int32_t i = 0; i < $I; i++) x[i] = (real)((7 * n + 3 * i) % 17 - 8) / 8;
         for (int32_t k = 0; k < $K; k++) e[k] = (real)((5 * n + 2 * k) % 13 - 6) / 8;
         take(state, x, y);

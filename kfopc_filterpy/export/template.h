@@ -5,7 +5,7 @@
  *     static ${name}_state state;
  *     ${name}_init(&state);
  *     for each sample:
- *         $statement    x(n) from the reference microphone$s, y(n) to the amplifier$s
+ *         $statement    ${x_from}y(n) to the amplifier$s
  *         ${name}_update(&state, e);    e(n) = d(n) - (s * y)(n) from the error microphone$s
  *
  * The state has $n_bytes bytes if a pointer has 8. No heap is used, and there is no state elsewhere.
@@ -53,7 +53,7 @@ typedef struct {
 /* Set the state to that of the export. */
 void ${name}_init(${name}_state *state);
 
-/* $returns the control signal y(n) for the newest reference sample x(n), from the weights of the last sample. */
+/* $returns the control signal y(n)$for_x, from the weights of the last sample. */
 $declared_control;
 
 /* Adapt to the error e(n) that this control signal left. Return ${NAME}_ADAPTED, or why the update was refused. */

@@ -14,6 +14,7 @@ from .._types import ChangingPaths, PerLoudspeaker, Seed
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
 from ..controllers.base import Controller, Looped, checked_controller, differing_counts, listening
 from ..controllers.core_controller import NO_SOLUTION, CoreController
+from ..controllers.processing import takes_none
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
 from ..paths.models import path_taps, sampling_rate
 from ..paths.path_matrix import feedback_paths, is_path_matrix, secondary_paths
@@ -41,7 +42,7 @@ ChangingAmplifiers: TypeAlias = Amplifiers | Sequence[tuple[float, Amplifiers]]
 
 def simulate(
     controller: Controller,
-    reference: ArrayLike,
+    reference: ArrayLike | None,
     *,
     secondary_path: ChangingPaths,
     primary_path: ChangingPaths | None = None,
