@@ -10,6 +10,7 @@ from .duct import DuctPaths as DuctPaths
 from .duct import duct_paths as duct_paths
 from .feedback_stability import FeedbackMargin as FeedbackMargin
 from .feedback_stability import feedback_margin as feedback_margin
+from .feedback_stability import internal_model_margin as internal_model_margin
 from .identification import IdentificationResult as IdentificationResult
 from .identification import PathEstimate as PathEstimate
 from .identification import estimate_path as estimate_path
