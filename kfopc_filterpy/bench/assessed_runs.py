@@ -11,6 +11,7 @@ import numpy as np
 
 from kfopc_filterpy import FxLMS, OutputPowerConstraint, SimulationResult, kf_opc, kf_pb, simulate
 from kfopc_filterpy.bounds import SuggestedSettings
+from kfopc_filterpy.controllers import with_internal_model
 
 from .._types import ProgressBar
 from .limits import ChannelLimits, Limits, amplifiers, clipping_limits, each_of, scaled
@@ -36,6 +37,7 @@ class Plan:
     settings: SuggestedSettings
     uncertainty: Any
     bar: Any
+    feedback: bool = False  # x is then what an exact internal model gives
     lock: Any = field(default_factory=threading.Lock)
 
     def outcome(self, name: str, limited: bool) -> SimulationResult | AllDivergedError:
@@ -58,15 +60,17 @@ class Plan:
     def run(self, name: str, *, limited: bool, share: float = 1.0) -> SimulationResult:
         """Run an algorithm, behind a limiter or not, with a share of the rating's power."""
         limits = scaled(self.limits, share)
+        controller = self.controller(name, limits, limited)
         return simulate(
-            self.controller(name, limits, limited),
-            self.x,
+            with_internal_model(controller) if self.feedback else controller,
+            None if self.feedback else self.x,
             disturbance=self.d,
             secondary_path=self.s,
             fs=self.fs,
             amplifier=amplifiers(limits),
             rated_power=limits.rated_power,
             switch_on_s=self.start / self.fs,
+            record_weights_every=self.x.shape[-1] - self.start - 1 if self.feedback else None,  # the first and the last
             progress=None if self.bar is None else self.advance,
         )
 

@@ -21,7 +21,7 @@ from kfopc_filterpy._validate import (
     as_signal,
     per_channel,
 )
-from kfopc_filterpy.bounds import coherence_bound
+from kfopc_filterpy.bounds import coherence_bound, predictor_reference
 from kfopc_filterpy.controllers.posterior import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.loop.inputs import channel_disturbances
 from kfopc_filterpy.metrics import (
@@ -31,12 +31,18 @@ from kfopc_filterpy.metrics import (
     peak_control_signal,
     third_octave_levels_db,
 )
-from kfopc_filterpy.paths import causality_margin, frequency_response
+from kfopc_filterpy.paths import (
+    FeedbackMargin,
+    causality_margin,
+    frequency_response,
+    internal_model_margin,
+    path_uncertainty,
+)
 from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.file_checks import require_different, require_heard, require_sound
 from kfopc_filterpy.paths.models import sampling_rate, tells_rate
 from kfopc_filterpy.paths.path_matrix import primary_paths, secondary_paths
-from kfopc_filterpy.paths.uncertainty import Uncertainty
+from kfopc_filterpy.paths.uncertainty import Uncertainty, as_uncertainty
 from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_remarks
 
 from .._types import PathModels, ProgressBar
@@ -73,6 +79,7 @@ def assess(
     secondary_path_uncertainty: Uncertainty | None = DEFAULT_UNCERTAINTY,
     pascal_per_unit: ArrayLike | None = None,
     switch_on_s: float | None = None,
+    feedback: bool = False,
     bar: ProgressBar | None = None,
 ) -> Assessment:
     """Return the verdict on an amplifier: whether it buys a noise reduction, what limits, and what to change.
@@ -85,7 +92,8 @@ def assess(
     Parameters
     ----------
     noise : array_like, shape (n_samples,) or (I, n_samples)
-        Recording of the reference microphones, with silent loudspeakers. The rate of a `Recording` must be `fs`.
+        Recording of the reference microphones, with silent loudspeakers; with `feedback` that of the error microphones.
+        The rate of a `Recording` must be `fs`.
     primary : array_like, shape (n_path,) or (K, I, n_path), or control.TransferFunction, optional
         Impulse response from each reference to each error microphone. None if there is a `disturbance`.
     secondary : array_like, shape (n_path,) or (K, J, n_path), or control.TransferFunction
@@ -119,6 +127,9 @@ def assess(
         are computed.
     switch_on_s : float, optional
         Time in s at which the control is switched on; by default 0.5 s, or a tenth of a shorter record.
+    feedback : bool, default False
+        Whether there is no reference microphone, as in headphones: the controllers predict the disturbance, see
+        `with_internal_model`. Then `noise` is the disturbance, and `primary` and `disturbance` are None.
     bar : tqdm bar, optional
         Bar that advances with the samples that are run, those on which FxLMS is tuned included; its total is set, and it
         is described by what is going on.
@@ -132,7 +143,8 @@ def assess(
     ------
     TypeError, ValueError
         Signals that are not finite, silent, too short for the filter or for a run of 2 s, or of different lengths; paths
-        whose channels do not fit the signals; neither a primary path nor a disturbance; a rating that does not limit the
+        whose channels do not fit the signals; neither a primary path nor a disturbance, or one of them with `feedback`; a
+        settled feedback loop without a margin, with the secondary path or one that was measured again; a rating that does not limit the
         mean power, or ratings for another number of loudspeakers; an unknown algorithm.
 
     Notes
@@ -149,6 +161,10 @@ def assess(
 
     If a loudspeaker's rating has an excursion, the rated power is the largest at which the best fixed filter's control
     signal keeps it.
+
+    With `feedback`, the ceilings are those of predictors: filters of the disturbance a sample late. One channel's settled
+    loop is judged by `paths.internal_model_margin`, with the least margin of `secondary` and of the paths that
+    `secondary_path_uncertainty` may hold.
 
     With several loudspeakers the required rated powers are in the proportions of the ratings. The coherence is the multiple
     coherence of all references. The causality margin is that of each microphone's earliest loudspeaker, at the worst
@@ -167,7 +183,12 @@ def assess(
     False amplifier
     """
     fs = as_positive(fs, "fs", unit="Hz")
-    x, d, s = recorded_signals(noise, primary, secondary, disturbance, fs)
+    if feedback and not (primary is None and disturbance is None):
+        raise ValueError(
+            "feedback=True takes neither primary nor disturbance: noise is the recording of the error microphones"
+        )
+    x, d, s = recorded_signals(noise, primary, secondary, noise if feedback else disturbance, fs)
+    x = predictor_reference(d) if feedback else x
     p = None if primary is None else primary_paths(primary, fs=fs, name="primary")[0]
     several = s.ndim == 3
     K, J, n_references = (*s.shape[:2], len(x)) if several else (1, 1, 1)
@@ -214,7 +235,7 @@ def assess(
         )
     names = [algorithm, *(name for name in others if name != algorithm)]
 
-    plan = Plan(x, d, s, fs, start, limits, settings, secondary_path_uncertainty, bar)
+    plan = Plan(x, d, s, fs, start, limits, settings, secondary_path_uncertainty, bar, feedback)
     announce(bar, sum(map(plan.planned_samples, names)), ", ".join(names))
     runs: dict[str, SimulationResult] = {}
     for name, outcome in zip(names, Runs().map(lambda name: plan.outcome(name, name == algorithm), names), strict=True):
@@ -226,6 +247,7 @@ def assess(
             notes.append(f"{name} is left out: {outcome}.")
     run = runs[algorithm]
     reached = _reduction(run)
+    loop = _settled_loop(run, s, secondary_path_uncertainty) if feedback and not several else None
     ceilings = Ceilings(
         coherence_db=None if disturbance is None else max(_coherence_db(bounds.x, bounds.d, fs), bounds.time_db),
         time_db=bounds.time_db,
@@ -250,6 +272,8 @@ def assess(
     notes += recording_remarks(noise, fs, "noise")
     if disturbance is not None:
         notes += clipping_remarks(disturbance, "disturbance")
+    elif feedback:
+        notes += _on_uncertain_path(loop, s, secondary_path_uncertainty)
     else:
         notes.append(
             "The disturbance was computed from the reference, so the coherence is not checked: record both microphones "
@@ -281,10 +305,12 @@ def assess(
         volts_per_unit=volts_per_unit,
         ohm=ohm,
         fs=fs,
-        channels=(n_references, J, K) if several else None,
+        channels=(0 if feedback else n_references, J, K) if several else None,
         pascal_per_unit=pascal_per_unit,
         switch_on_s=start / fs,
         response_s=None if p is None else _response_s(p, s, want_db, fs),
+        feedback=feedback,
+        loop=loop,
     )
     return replace(assessment, advice=tuple(advice_on(assessment)))
 
@@ -369,6 +395,39 @@ def _reduction(run: SimulationResult) -> float:
     """Return the noise reduction of a run in dB; -Inf if it diverged."""
     reached = noise_reduction_db(run.error, run.disturbance)
     return -np.inf if np.isnan(reached) else reached
+
+
+def _settled_loop(run: SimulationResult, s: np.ndarray, uncertainty: Any) -> FeedbackMargin | None:
+    """Return the least margin of a run's last control filter, for all measured paths; None if the run diverged."""
+    if run.diverged_at_s is not None or run.weights is None:
+        return None
+    stated = as_uncertainty(uncertainty)
+    measured = [s, *np.reshape(stated, (-1, np.shape(stated)[-1]))] if np.ndim(stated) > 1 else [s]
+    loops = [internal_model_margin(run.weights[-1], path, s, fs=run.fs) for path in measured]
+    least = min(loops, key=lambda loop: loop.disk_margin)
+    if not least.stable:
+        raise ValueError(
+            f"the settled loop of {run.algorithm} has no margin: it is unstable with measured secondary path "
+            f"{loops.index(least)} of those that state its uncertainty; measure the path as it is in use, or use another "
+            "algorithm or fewer taps"
+        )
+    return least
+
+
+def _on_uncertain_path(loop: FeedbackMargin | None, s: np.ndarray, uncertainty: Any) -> list[str]:
+    """Return where the path may be more wrong than the settled loop surely stands; measured paths were tried."""
+    if loop is None or np.ndim(as_uncertainty(uncertainty)) > 1:
+        return []
+    error = path_uncertainty(uncertainty, s)
+    frequencies = np.linspace(0.0, 1.0 / (2.0 * loop.loop.dt), error.size)
+    stood = loop.path_error_at(frequencies)
+    worst = int(np.argmax(error / stood))
+    if error[worst] < stood[worst]:
+        return []
+    return [
+        f"The secondary path may be wrong by {error[worst]:.0%} at {frequencies[worst]:.0f} Hz, where the settled loop "
+        f"stands {stood[worst]:.0%}: measure it again as it is in use, and state both measurements."
+    ]
 
 
 def _least_share(plan: Plan, name: str, want_db: float, start: float, unit: float) -> float:

@@ -36,6 +36,7 @@ from kfopc_filterpy.bounds import SuggestedSettings
 
 from .._types import NumberOrArray
 from .._writing import replacing_files
+from ..paths import FeedbackMargin
 from .fixed_filters import longest_filter
 from .limits import Limits
 from .study_report import jsonable
@@ -177,6 +178,10 @@ class Assessment:
     response_s : float or None
         Time from the first sound of a loudspeaker until the primary path has delivered the energy that must be removed:
         the control filter has to be so long. None without a primary path.
+    feedback : bool
+        Whether there is no reference microphone.
+    loop : FeedbackMargin or None
+        Stability of the settled loop of a feedback controller of one channel; None otherwise, or if the run diverged.
     origin : dict of str to str
         What the page says of where it comes from: the command, and each file.
     """
@@ -210,6 +215,8 @@ class Assessment:
     pascal_per_unit: Any = None
     switch_on_s: float = 0.0
     response_s: float | None = None
+    feedback: bool = False
+    loop: FeedbackMargin | None = None
     origin: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -239,6 +246,18 @@ class Assessment:
             rated=self.power(self.limits.rated_power),
         )
 
+    @property
+    def stability(self) -> str:
+        """Which error of its path a settled feedback loop stands, as one sentence; empty without such a loop."""
+        if self.loop is None:
+            return ""
+        loop = self.loop
+        return (
+            f"The settled loop stands a secondary path that is wrong by {loop.path_error:.0%} (the least, at "
+            f"{loop.path_error_hz:.0f} Hz); its gain may change by {loop.gain_margin_db:.1f} dB or its phase by "
+            f"{loop.phase_margin_deg:.0f} degrees."
+        )
+
     def power(self, rated_power: NumberOrArray) -> str:
         """Return a `rated_power` in words: in W if the impedance is known, else in squared units."""
         if self.watt_per_power is None:
@@ -253,7 +272,7 @@ class Assessment:
         return None if self.ohm is None or self.volts_per_unit is None else self.volts_per_unit**2 / self.ohm
 
     def __repr__(self) -> str:
-        lines = [self.verdict, self.reason, *self.advice]
+        lines = [self.verdict, self.reason, self.stability, *self.advice]
         return "\n".join(line for text in lines if text for line in textwrap.wrap(text, 110))
 
     def to_dict(self) -> dict[str, Any]:
@@ -295,7 +314,8 @@ class Assessment:
                 "version": __version__,
                 "origin": self.origin,
             }
-            | ({"channels": dict(zip(counts, self.channels, strict=True))} if self.channels else {}),
+            | ({"channels": dict(zip(counts, self.channels, strict=True))} if self.channels else {})
+            | ({"loop": {name: value for name, value in vars(self.loop).items() if name != "loop"}} if self.loop else {}),
             "verdict",
         )
 
@@ -365,6 +385,11 @@ def advice_on(verdict: Assessment, *, fs: str = "fs=", n_taps: str = "n_taps=") 
     if verdict.limited_by == "causality":
         delay = verdict.helpful_delay_s
         late = f"With {1e3 * delay:.2g} ms more" if delay is not None else "With more time"
+        if verdict.feedback:
+            return [
+                f"{late} for the prediction, the same filter reaches {want}: move the loudspeaker towards the error "
+                "microphone, shorten the latency of the electronics, or add a reference microphone (hybrid control)."
+            ]
         return [
             f"{late} between the reference microphone and the loudspeaker, the same filter reaches {want}: move the "
             "microphone towards the source or the loudspeaker towards the error microphone, or shorten the latency of the "

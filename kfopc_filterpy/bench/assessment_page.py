@@ -276,7 +276,9 @@ def _checks(verdict: Assessment) -> dict[str, str]:
     decided = [limits.decided_by] if isinstance(limits.decided_by, str) else dict.fromkeys(limits.decided_by)
     peak = "no peak limit" if limits.amplitude_limit is None else _peak_limits(verdict)
     causality, least = "unknown without a primary path", f"Least power for {verdict.want_db:g} dB"
-    if late is not None:
+    if verdict.feedback:
+        causality = "the error microphone hears each control signal by the delay of the secondary path later"
+    elif late is not None:
         causality = f"the anti-noise is {abs(1e3 * late):.2g} ms {'early' if late >= 0 else 'late'}"
     checks = {
         "Rating": f"{verdict.power(limits.rated_power)}, decided by the {', '.join(decided)}; {peak}; "
@@ -288,6 +290,8 @@ def _checks(verdict: Assessment) -> dict[str, str]:
         "Band of the noise": f"90 % of its power from {band.low_hz:.0f} to {band.high_hz:.0f} Hz; "
         f"{band.weak_share:.1%} where the loudspeaker is 20 dB weaker than its mean there",
     }
+    if verdict.stability:
+        checks["Stability"] = verdict.stability
     if verdict.levels is not None:
         before, after = (listed(one, ".1f") for one in (verdict.levels.before_dba, verdict.levels.after_dba))
         checks["A-weighted level"] = f"{before} dBA without control, {after} dBA with it"

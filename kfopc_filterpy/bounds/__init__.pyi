@@ -4,6 +4,7 @@ from .power_constrained import ControlFilter as ControlFilter
 from .power_constrained import ControlFilters as ControlFilters
 from .power_constrained import PowerConstrainedWiener as PowerConstrainedWiener
 from .power_constrained import power_constrained_solution as power_constrained_solution
+from .prediction import predictor_reference as predictor_reference
 from .rated_power import BudgetedRatedPower as BudgetedRatedPower
 from .rated_power import RatedPower as RatedPower
 from .rated_power import budgeted_rated_power as budgeted_rated_power
