@@ -401,7 +401,7 @@ def _settled_loop(run: SimulationResult, s: np.ndarray, uncertainty: Any) -> Fee
     """Return the least margin of a run's last control filter, for all measured paths; None if the run diverged."""
     if run.diverged_at_s is not None or run.weights is None:
         return None
-    stated = as_uncertainty(uncertainty)
+    stated: Any = as_uncertainty(uncertainty)
     measured = [s, *np.reshape(stated, (-1, np.shape(stated)[-1]))] if np.ndim(stated) > 1 else [s]
     loops = [internal_model_margin(run.weights[-1], path, s, fs=run.fs) for path in measured]
     least = min(loops, key=lambda loop: loop.disk_margin)
@@ -416,7 +416,8 @@ def _settled_loop(run: SimulationResult, s: np.ndarray, uncertainty: Any) -> Fee
 
 def _on_uncertain_path(loop: FeedbackMargin | None, s: np.ndarray, uncertainty: Any) -> list[str]:
     """Return where the path may be more wrong than the settled loop surely stands; measured paths were tried."""
-    if loop is None or np.ndim(as_uncertainty(uncertainty)) > 1:
+    stated: Any = as_uncertainty(uncertainty)
+    if loop is None or np.ndim(stated) > 1:
         return []
     error = path_uncertainty(uncertainty, s)
     frequencies = np.linspace(0.0, 1.0 / (2.0 * loop.loop.dt), error.size)

@@ -315,7 +315,11 @@ class Assessment:
                 "origin": self.origin,
             }
             | ({"channels": dict(zip(counts, self.channels, strict=True))} if self.channels else {})
-            | ({"loop": {name: value for name, value in vars(self.loop).items() if name != "loop"}} if self.loop else {}),
+            | (
+                {"loop": {name: value for name, value in vars(self.loop).items() if name != "loop"}}
+                if self.loop
+                else {}
+            ),
             "verdict",
         )
 

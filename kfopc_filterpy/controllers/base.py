@@ -63,6 +63,12 @@ def checked_controller(controller: Any) -> Any:
     return controller
 
 
+def require_own_references(controller: Any, wrapper: str) -> None:
+    """Raise ValueError if an internal model gives a controller references that a wrapper does not know of."""
+    if getattr(controller, "internal_model", False):
+        raise ValueError(f"{wrapper} takes no controller with an internal model: give it the controller without one")
+
+
 def differing_counts(controller: Any, **counts: int) -> Iterator[tuple[str, int]]:
     """Yield the numbers of channels that a controller states, by name, and that differ from these."""
     for name, count in counts.items():

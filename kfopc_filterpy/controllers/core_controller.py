@@ -520,7 +520,12 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
             block.leave()
 
     def process(
-        self, references: ArrayLike | None, errors: ArrayLike, *, adapt: bool | ArrayLike = True, out: np.ndarray | None = None
+        self,
+        references: ArrayLike | None,
+        errors: ArrayLike,
+        *,
+        adapt: bool | ArrayLike = True,
+        out: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
         looped = self.looped()

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._validate import as_channels, as_number, as_positive
 from ..power.constraint import DEFAULT_FS
-from .base import Controller, WrappedController, listening
+from .base import Controller, WrappedController, listening, require_own_references
 from .channel_samples import LOUDEST, amplified, amplifier_functions, channel_sample, require_moderate
 from .posterior import DEFAULT_UNCERTAINTY, LEAST_SPREAD, PathObserver, relative_spread
 
@@ -144,6 +144,7 @@ class VerifiedController(WrappedController):
         self, controller: Controller, *, fs: float = DEFAULT_FS, memory_s: float = 20.0, amplifier: Any = None
     ) -> None:
         super().__init__(controller, "with a verified path")
+        require_own_references(controller, "VerifiedController")
         if hasattr(controller, "physical") or not (
             hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")
         ):

@@ -14,7 +14,7 @@ from .._validate import as_channels, as_count, as_real_array, per_channel, requi
 from ..paths.observation import ObservationFilters
 from ..paths.path_matrix import secondary_paths
 from ..power.amplifiers import Amplifiers
-from .base import Controller, WrappedController, differing_counts, listening
+from .base import Controller, WrappedController, differing_counts, listening, require_own_references
 from .channel_samples import ChannelFilters, PlayedSound, require_moderate
 
 if TYPE_CHECKING:
@@ -279,6 +279,7 @@ class VirtualMicrophones(WrappedController):
         amplifier: Amplifiers = None,
     ) -> None:
         super().__init__(controller, "with virtual microphones")
+        require_own_references(controller, "VirtualMicrophones")
         secondary, self._path_fs = secondary_paths(secondary_path)
         self.n_microphones, self.n_loudspeakers, _ = secondary.shape
         self.physical = self._indices(physical, "physical")

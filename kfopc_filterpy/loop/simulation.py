@@ -166,6 +166,7 @@ def simulate(
         if isinstance(signal, Recording):
             sampling_rate(signal, fs, name=name)
     several = is_multichannel(controller, reference, secondary_path, disturbance)
+    given: Any = reference
     none = takes_none(controller, reference)
     x, d, secondary = _read_signals(
         reference, noise_level_db, primary_path, disturbance, secondary_path, fs, crossfade_s, several
@@ -227,7 +228,7 @@ def simulate(
     found = {name: getattr(signals, name) for name in names} | recorded
     if not hasattr(controller, "power_weight"):
         found.pop("power_weight", None)
-    if not several or (np.ndim(reference) == 1 and J == K == 1):  # one channel drops its axis, as it was given
+    if not several or (np.ndim(given) == 1 and J == K == 1):  # one channel drops its axis, as it was given
         x, d, found = x if none else x[0], d[0], {name: signal[0] for name, signal in found.items()}
         rated = None if rated is None else float(np.ravel(rated)[0])
     return SimulationResult(
@@ -340,7 +341,7 @@ class _Run:
 
 
 def is_multichannel(
-    controller: object, reference: ArrayLike, secondary_path: ChangingPaths, disturbance: ArrayLike | None
+    controller: object, reference: Any, secondary_path: ChangingPaths, disturbance: ArrayLike | None
 ) -> bool:
     """Return whether a run has several channels: its controller, one of its signals or its secondary paths say so."""
     own = isinstance(controller, CoreController) and controller.multichannel
@@ -379,8 +380,8 @@ def _read_signals(
     """Return references (I, n), disturbances (K, n) and secondary paths (K, J, taps)."""
     if reference is None and (disturbance is None or primary_path is not None):
         raise ValueError("without a reference give disturbance=, not primary_path=: the path would begin at the reference")
-    given = ("disturbance", disturbance) if reference is None else ("reference", reference)
-    signal = np.atleast_2d((as_channels if several else as_signal)(given[1], given[0]))
+    heard = ("disturbance", disturbance) if reference is None else ("reference", reference)
+    signal = np.atleast_2d((as_channels if several else as_signal)(heard[1], heard[0]))
     x = signal[:0] if reference is None else signal
     if disturbance is not None and noise_level_db != 0.0:
         raise ValueError(

@@ -147,6 +147,11 @@ class Supervisor(Checkpointed):
         blocks_can_repeat: bool = True,
     ) -> None:
         self._controller: Any = checked_controller(controller)
+        if getattr(controller, "n_references", 1) == 0:
+            raise ValueError(
+                "controller must have a reference microphone: a feedback controller without one runs by its own "
+                "process(None, errors), without a supervisor"
+            )
         self.fs = as_positive(fs, "fs", unit="Hz")
         if hasattr(controller, "require_sample_rate"):
             controller.require_sample_rate(self.fs)

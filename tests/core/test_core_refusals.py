@@ -187,7 +187,7 @@ class Guarded:
         pointers = (ctypes.c_void_p(self.algorithm.pointer), ctypes.byref(plan), self.view, memory)
         assert not library.anc_open(*pointers, ctypes.c_size_t(self.size - 1), 1), "took too few bytes"
         self.opened = bool(library.anc_open(*pointers, ctypes.c_size_t(self.size), 1))
-        control, update = self.algorithm.steps
+        control, update, _ = self.algorithm.steps
         self.control_signal = ctypes.PYFUNCTYPE(ctypes.c_int, *(ctypes.c_void_p,) * 3)(control)
         self.update = ctypes.PYFUNCTYPE(ctypes.c_int, *(ctypes.c_void_p,) * 2)(update)
 
