@@ -38,7 +38,7 @@ from kfopc_filterpy import (
     kf_pb,
     simulate,
 )
-from kfopc_filterpy.controllers import CoreController, VerifiedController, load_algorithm
+from kfopc_filterpy.controllers import CoreController, VerifiedController, load_algorithm, with_internal_model
 from kfopc_filterpy.core.building import FOLDER, core_sources
 from kfopc_filterpy.export import Float32Controller, export_c
 
@@ -124,6 +124,9 @@ CONTROLLERS = {f"{name}, everything": lambda name=name: with_everything(name) fo
         L, S_TWO_HAT, rated_power=[RATED, 0.3], fs=16000.0, n_references=2, limiter=[limiter(), limiter(0.3)]
     ),
     "fast array": lambda: made("fast array"),
+    "hybrid KF-OPC": lambda: with_internal_model(
+        kf_opc(L, S_TWO_HAT, rated_power=RATED, n_references=3, limiter=[limiter(), limiter(0.3)], **NOISES)
+    ),
 }
 
 
@@ -205,6 +208,24 @@ def test_the_bits_are_those_of_python(name, dtype, tmp_path):
     assert out.self_tests == [0, 0]
     assert not out.status.any()
     assert out.n_bytes == program.exported.n_bytes
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("several", [False, True])
+def test_a_feedback_controller_has_no_reference_argument(several, dtype, tmp_path):
+    """The example runs the self-test first, which compares with the bits of Python."""
+    path, n_references = (S_TWO_HAT, 2) if several else (S_HAT, 1)
+    controller = with_internal_model(kf_opc(L, path, rated_power=RATED, n_references=n_references, **NOISES))
+    errors = 0.1 * noises()[1][: 1 + several, :200]
+    controller.process(None, errors if several else errors[0])
+    exported = export_c(controller, tmp_path / "out", dtype=dtype)
+    number = "double" if dtype == "float64" else "float"
+    declared = f"void anc_control_signal(anc_state *state, {number} control" if several else "(anc_state *state);"
+    assert declared in exported.header_path.read_text()
+    flags = re.search(r"(-std=c99 .*)", exported.header_path.read_text())[1].split()
+    files = [tmp_path / "out" / file for file in ("main.c", "anc.c")]
+    succeeds(c_compiler(), *flags, *WARNINGS, *FAST, *files, "-lm", "-o", tmp_path / "main")
+    succeeds(tmp_path / "main")
 
 
 @pytest.mark.slow
