@@ -1,6 +1,6 @@
-"""The figures of the pages on constraints and on a path that is not exactly known.
+"""The figures of the pages on constraints, on a path that is not exactly known, and on feedback control.
 
-``python docs/page_figures.py docs/figures`` draws both.
+``python docs/page_figures.py docs/figures`` draws them.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.signal import lfilter
 
 from kfopc_filterpy import (
     OutputPowerConstraint,
@@ -24,7 +25,8 @@ from kfopc_filterpy import (
     power_constrained_wiener,
     simulate,
 )
-from kfopc_filterpy.bounds import PowerConstrainedWiener
+from kfopc_filterpy.bounds import PowerConstrainedWiener, power_constrained_solution, predictor_reference
+from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.paths import PathTolerance, path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
 from kfopc_filterpy.signals import band_limited_noise
@@ -121,7 +123,42 @@ def uncertainty() -> Figure:
     return figure
 
 
+def predictions(delays: Sequence[int] = range(9), duration_s: float = 10.0) -> Reduction:
+    """Return the noise reduction of feedback control, one for each delay of the secondary path in samples."""
+    pole, rate, rated = 0.95, 8000.0, 0.3
+    d = lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], np.random.default_rng(0).standard_normal(int(duration_s * rate)))
+    half = d[d.size // 2 :]
+    found: Reduction = {name: [] for name in ("closed form", "bound", "KF-PB", "KF-OPC")}
+    for delay in delays:
+        path, limit = np.eye(delay + 1)[delay], OutputPowerConstraint(rated, fs=rate)
+        bound = power_constrained_solution(predictor_reference(half), half, path, 8, rated)
+        controllers = (
+            kf_pb(8, path, rated_power=rated, fs=rate, averaging_s=1.0),
+            kf_opc(8, path, constraint=limit, state_noise=1e-12, measurement_noise=0.3),
+        )
+        runs = (
+            simulate(with_internal_model(c), None, disturbance=d, secondary_path=path, fs=rate) for c in controllers
+        )
+        best = -10 * np.log10(1 - pole ** (2 * (delay + 1)))
+        reached = [noise_reduction_db(run.error, run.disturbance) for run in runs]
+        for own, value in zip(found.values(), (best, bound.noise_reduction_db, *reached), strict=True):
+            own.append(value)
+    return found
+
+
+def feedback() -> Figure:
+    """Return the noise reduction of feedback control against the delay of the secondary path."""
+    figure = Figure(figsize=(6.4, 3.6), layout="constrained")
+    ax = figure.subplots()
+    for name, reductions in predictions().items():
+        ax.plot(reductions, {"closed form": "k--", "bound": "k-"}.get(name, "o"), label=name)
+    ax.set(xlabel="Delay of the secondary path (samples)", ylabel="Noise reduction (dB)")
+    ax.legend(frameon=False)
+    ax.grid(alpha=0.3)
+    return figure
+
+
 if __name__ == "__main__":
     folder = Path(sys.argv[1])
-    for draw in (constraint, uncertainty):
+    for draw in (constraint, uncertainty, feedback):
         draw().savefig(folder / f"{draw.__name__}.png", dpi=130)

@@ -19,6 +19,7 @@ WORDS = {
     "embedded": ("microcontroller", "DSP", "C code", "FMU", "Simulink"),
     "to_the_board": ("board",),
     "speed": ("speed", "benchmark"),
+    "feedback": ("feedback", "headphone", "hybrid"),
     "uncertainty": ("uncertainty", "wrong path"),
     "tutorials/index": ("tutorial", "example"),
     "tutorials/noise_control": ("beginner", "noise reduction"),

@@ -379,7 +379,9 @@ def _read_signals(
 ) -> tuple[np.ndarray, np.ndarray, Schedule]:
     """Return references (I, n), disturbances (K, n) and secondary paths (K, J, taps)."""
     if reference is None and (disturbance is None or primary_path is not None):
-        raise ValueError("without a reference give disturbance=, not primary_path=: the path would begin at the reference")
+        raise ValueError(
+            "without a reference give disturbance=, not primary_path=: the path would begin at the reference"
+        )
     heard = ("disturbance", disturbance) if reference is None else ("reference", reference)
     signal = np.atleast_2d((as_channels if several else as_signal)(heard[1], heard[0]))
     x = signal[:0] if reference is None else signal

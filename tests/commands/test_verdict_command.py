@@ -19,10 +19,11 @@ from helpers.commands import FS, SCENE, process
 from kfopc_filterpy import bench
 from kfopc_filterpy.bench import assess
 from kfopc_filterpy.bench.assessment import SCHEMA
+from kfopc_filterpy.bounds import predictor_reference, wiener_solution
 from kfopc_filterpy.commands import main
 from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance
-from kfopc_filterpy.signals import band_limited_noise, write_wav
+from kfopc_filterpy.signals import band_limited_noise, read_recording, write_wav
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -254,3 +255,40 @@ def test_the_exit_code_is_that_of_all_amplifiers_together(command, several):
     assert code == 1
     assert "1, 0.0001 W into 8 ohm" in out
     assert "The amplifier limits" in out
+
+
+def test_without_a_reference_microphone_the_noise_is_that_of_the_ear(command, folder, tmp_path):
+    rating = ["--rated-power", "1", "--taps", "32", "--want-db", "3"]
+    code, out, err = command(
+        "verdict", "d.wav", "--feedback", "--secondary", "S.wav", *rating, "--json", "-o", tmp_path / "out"
+    )
+    assert code in (0, 1), err
+    data = json.loads(out)
+    jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
+    assert 0 < data["loop"]["path_error"] < 10
+    page = (tmp_path / "out" / "verdict.html").read_text("utf-8")
+    assert "settled loop stands a secondary path that is wrong by" in page
+    assert data["ceilings"]["coherence_db"] is None
+    d, s = (read_recording(folder / f"{name}.wav").one_channel() for name in ("d", "S"))
+    half = d[d.size // 2 :] - d.mean()
+    free = wiener_solution(predictor_reference(half), half, s, 32)
+    assert data["ceilings"]["filter_db"] == pytest.approx(
+        free.noise_reduction_db, abs=0.2
+    )  # whose stretches differ a bit
+
+
+@pytest.mark.parametrize("more", [["--primary", "P.wav"], ["--disturbance", "d.wav"]])
+def test_feedback_takes_no_path_from_a_reference(command, more):
+    code, _, err = command("verdict", "d.wav", "--feedback", "--secondary", "S.wav", "--rated-power", "1", *more)
+    assert code == 2
+    assert "--feedback takes neither --primary nor --disturbance" in err
+
+
+def test_a_settled_loop_that_a_measured_path_makes_unstable_is_refused(command, folder):
+    """A path of the other sign: the loop's gain is then -2 T, and |T| is nearly 1 where the noise is."""
+    write_wav(folder / "tone.wav", np.sin(0.5 * np.arange(24000)), FS)
+    write_wav(folder / "turned.wav", -2 * read_recording(folder / "S.wav").one_channel(), FS)
+    scene = ["tone.wav", "--feedback", "--secondary", "S.wav", "--secondary-again", "turned.wav", "--rated-power", "2"]
+    code, _, err = command("verdict", *scene, "--taps", "16", "--algorithm", "KF-OPC")
+    assert code == 2
+    assert "has no margin" in err

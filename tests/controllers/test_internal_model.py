@@ -10,7 +10,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from helpers.checkpoints import contents
-from helpers.controllers import KALMAN, MAKERS, MANY, PATHS, SEVERAL, VARIANTS, K, made
+from helpers.controllers import KALMAN, MAKERS, MANY, PATHS, SEVERAL, VARIANTS, K, constraint, made
 from helpers.loop import AMPLIFIERS, FS, MU, N_TAPS, S_HAT, N, S, noises, run
 from scipy.signal import lfilter
 
@@ -52,7 +52,7 @@ def past(signal: np.ndarray, n: int, taps: int) -> np.ndarray:
 
 def own_filter(**_: Any) -> KalmanController:
     """A controller around an estimator of filterpy, whose steps are in Python."""
-    return KalmanController(KFOPC.random_walk(N_TAPS, rated_power=0.3, **KALMAN), S_HAT)
+    return KalmanController(KFOPC.random_walk(N_TAPS, constraint=constraint(), **KALMAN), S_HAT)
 
 
 def test_the_loop_is_that_of_ten_lines_of_numpy() -> None:
@@ -247,14 +247,14 @@ def test_a_refused_error_leaves_the_state_and_one_that_never_comes_counts_as_sil
         (lambda f: simulate(f, D, disturbance=D, secondary_path=S), "reference must be None"),
         (lambda f: simulate(f, None, primary_path=[1.0], secondary_path=S), "without a reference give disturbance="),
         (lambda f: simulate_scenarios([f], D, disturbance=D, secondary_path=S), "internal model"),
-        (lambda f: with_internal_model(f), "has an internal model"),
+        (with_internal_model, "has an internal model"),
         (lambda f: with_internal_model(FxLMS(4, PATHS, step_size=MU, n_references=K - 1)), "for each of the 3 error"),
         (lambda f: FeedbackNeutralizer(f, [0.0, 1.0]), "n_references of 0"),
         (
             lambda f: VirtualMicrophones(f, np.ones((2, 1, 4)), [[[1.0]]], physical=[0]),
             "no controller with an internal",
         ),
-        (lambda f: VerifiedController(f), "no controller with an internal"),
+        (VerifiedController, "no controller with an internal"),
         (lambda f: Supervisor(f, fs=FS, amplitude_limit=1.0), "must have a reference microphone"),
         (lambda f: FxLMS(4, S, step_size=MU).control_signal(None), "with_internal_model"),
         (lambda f: FxLMS(4, S, step_size=MU).process(None, [1.0]), "with_internal_model"),

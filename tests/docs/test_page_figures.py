@@ -41,6 +41,14 @@ def test_a_guard_protects_and_costs_and_kf_pb_learns_the_path():
     assert np.ptp(found["KF-PB"]) < 0.5
 
 
+def test_feedback_control_reaches_the_bound_within_the_rated_power():
+    """The noise is correlated over 20 samples, and 5 s of it are judged: 0.3 dB."""
+    found = page_figures.predictions((0, 3))
+    assert found["KF-PB"] == pytest.approx(found["bound"], abs=0.3)
+    assert np.all(np.array(found["bound"]) < found["closed form"])
+    assert np.all(np.array(found["KF-OPC"]) < found["bound"])
+
+
 def test_kf_opc_takes_three_times_its_rated_power_in_the_figure():
     secondary, limit = [0.0, 0.0, 0.0, 1.0, -0.6], OutputPowerConstraint(0.3, fs=8000.0)
     controller = kf_opc(24, secondary, constraint=limit, state_noise=1e-9, measurement_noise=1e-3)
