@@ -313,7 +313,7 @@ class _Run:
         return False, x.shape[1]
 
     def _sample(self, values: np.ndarray) -> Any:
-        """Return a sample as the controller takes it: a number, with several channels an array, without any None."""
+        """Return a sample as the controller takes it: a number, an array of several channels, or None of no channel."""
         if not values.size:
             return None
         return values.copy() if self.several else float(values[0])
