@@ -69,7 +69,7 @@ class FeedbackMargin:
         )
 
     def path_error_at(self, frequencies_hz: ArrayLike) -> np.ndarray:
-        """Return the relative error of the path that the loop stands at each frequency in Hz, (n_frequencies,).
+        """Return the relative error of the path that the loop stands at each of `frequencies_hz`, (n_frequencies,).
 
         Each value is ``1/|T| = |1 + 1/loop|``, which means something for a loop that is stable.
         """
