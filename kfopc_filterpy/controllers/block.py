@@ -12,7 +12,7 @@ from ..checkpoint import Checkpointed
 from .base import calls_of, require_rates
 from .channel_samples import LOUDEST, require_moderate
 from .channels import Channels
-from .processing import BlockProcessing, adapt_flags, output_array, require_apart, require_one_length
+from .processing import BlockProcessing, adapt_flags, output_array, require_apart, require_one_length, takes_none
 
 LOUDEST_ERROR = 1e100  # as loud as the weights that are kept can make it, so that it can fall again
 MOST_WEIGHT = 1e80  # a step that leads beyond it is left out
@@ -213,9 +213,15 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
             self._end_block()
 
     def process(
-        self, references: ArrayLike, errors: ArrayLike, *, adapt: bool | ArrayLike = True, out: np.ndarray | None = None
+        self,
+        references: ArrayLike | None,
+        errors: ArrayLike,
+        *,
+        adapt: bool | ArrayLike = True,
+        out: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
+        takes_none(self, references)
         x = self._block_signal(references, "references", self.n_references)
         e = self._block_signal(errors, "errors", self.n_microphones)
         loud = np.abs(x).max() > LOUDEST or np.abs(e).max() > LOUDEST_ERROR

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -213,7 +214,7 @@ def duct_paths(
     fs = as_positive(fs, "fs", unit="Hz")
     duct = Duct() if duct is None else duct
     length, (r0, r1) = duct.length_m, duct.reflection
-    loss = duct.attenuation_db_per_m / (20 * np.log10(np.e))
+    loss = duct.attenuation_db_per_m / (20 * np.log10(math.e))
     f = np.fft.rfftfreq(_N_FFT, 1 / fs)
 
     def travel(distance: float) -> np.ndarray:
