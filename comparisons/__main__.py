@@ -22,13 +22,16 @@ def _study(module: str, main: str = "main") -> Study:
 
 
 SPEED = "speed"
-ALONE = {"sweep": ".sweep.command", "soak": ".soak.study", "board": ".board.study"}  # with options of their own
+ALONE = {  # with options of their own
+    "sweep": ".sweep.command",
+    "soak": ".soak.study",
+    "board": ".board.study",
+    "benchmark": ".benchmark.study",
+}
 STUDIES = {name: _study(name) for name in ("tonal", "broadband", "duct")}
 STUDIES["duct-measured"] = _study("duct", "main_measured")
-BEYOND_THE_PAPER = (
-    *("constraint", "kf_pb", "loss_map", "rated_powers", "mismatch", "uncertain_path", "tracking", "amplifier"),
-    "multichannel",
-)
+BEYOND_THE_PAPER = ["constraint", "kf_pb", "loss_map", "rated_powers", "mismatch", "uncertain_path", "tracking"]
+BEYOND_THE_PAPER += ["amplifier", "multichannel"]
 FURTHER = {"duct-motor": _study("duct", "main_motor"), **{name: _study(name) for name in BEYOND_THE_PAPER}}
 
 

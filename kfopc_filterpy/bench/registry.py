@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -303,6 +304,18 @@ def algorithms(*, several_channels: bool = False) -> Mapping[str, Algorithm]:
     return MappingProxyType(
         {name: own for name, own in REGISTRY.items() if own.several_channels or not several_channels}
     )
+
+
+@contextmanager
+def registered(entries: Mapping[str, Algorithm]) -> Iterator[None]:
+    """Let `tune` and others know further algorithms by name for a while; those of the registry stay as they are."""
+    further = {name: own for name, own in entries.items() if name not in REGISTRY}
+    REGISTRY.update(further)
+    try:
+        yield
+    finally:
+        for name in further:
+            del REGISTRY[name]
 
 
 def make_controller(

@@ -1,0 +1,234 @@
+"""The entries: the algorithms of this package, and adaptive filters of others, whose code is used as it is installed.
+
+Filters of other packages are made for system identification or for filtered-x LMS. Each gets the structure that its
+interface asks for, a setting from a grid of its own, and the rule that tunes all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from kfopc_filterpy.bench import Algorithm, algorithms
+from kfopc_filterpy.bounds import wiener_solution
+from kfopc_filterpy.controllers import SubfilterKalman, band_subfilters
+from kfopc_filterpy.controllers.channel_samples import ChannelFilters
+
+from .blocks import BlockController
+from .tasks import Task
+
+STEPS = (1.0, 0.25, 1 / 16, 1 / 64, 1 / 256)  # fewer than for our own: their samples take a hundred times as long
+FORGOTTEN = (1e-5, 1e-4, 1e-3)
+STATE_NOISES = (1e-7, 1e-6, 1e-5)
+DESIGN_S, DESIGN_RIDGE = 4.0, 1e-4  # of the white noise by which sub-filters are designed
+
+
+class FilteredX:
+    """A filter for system identification in the modified filtered-x structure: it identifies d^ = e + s^ * y from x'.
+
+    Parameters
+    ----------
+    n_taps, secondary_path
+        As for the controllers of the package.
+    adapt : callable
+        Adapts the filter to the newest n_taps samples of x', the newest first, and to d^.
+    weights : callable
+        Returns the filter's weights, (n_taps,), that of the newest sample first.
+    """
+
+    def __init__(
+        self,
+        n_taps: int,
+        secondary_path: np.ndarray,
+        adapt: Callable[[np.ndarray, float], Any],
+        weights: Callable[[], np.ndarray],
+    ) -> None:
+        self._adapt, self._weights = adapt, weights
+        self._path, self._played = (ChannelFilters(secondary_path[np.newaxis, np.newaxis]) for _ in range(2))
+        self._x, self._filtered = np.zeros((2, n_taps))
+
+    def control_signal(self, reference: float) -> float:
+        """Return the control signal for the newest reference sample."""
+        self._path.push(np.array([reference]))
+        for line, newest in ((self._x, reference), (self._filtered, self._path.output()[0])):
+            line[1:] = line[:-1]
+            line[0] = newest
+        y = float(self._weights() @ self._x)
+        self._played.push(np.array([y]))
+        return y
+
+    def update(self, error: float) -> None:
+        """Let the filter adapt, once it has heard something: some divide by the energy of what they hear."""
+        if self._filtered.any():
+            self._adapt(self._filtered, float(error + self._played.output()[0]))
+
+
+# ---- Filters of other packages
+
+
+def _padasip_nlms(n_taps: int, path: np.ndarray, *, step_size: float, regularization: float) -> FilteredX:
+    from padasip.filters import FilterNLMS
+
+    nlms = FilterNLMS(n_taps, mu=step_size, eps=regularization, w="zeros")
+    return FilteredX(n_taps, path, lambda row, d: nlms.adapt(d, row), lambda: nlms.w)
+
+
+def _padasip_rls(n_taps: int, path: np.ndarray, *, forgetting: float, initial_variance: float) -> FilteredX:
+    from padasip.filters import FilterRLS
+
+    rls = FilterRLS(n_taps, mu=forgetting, eps=1.0 / initial_variance, w="zeros")
+    return FilteredX(n_taps, path, lambda row, d: rls.adapt(d, row), lambda: rls.w)
+
+
+def _pyroomacoustics_nlms(n_taps: int, path: np.ndarray, *, step_size: float, regularization: float) -> FilteredX:
+    from pyroomacoustics.adaptive import NLMS
+
+    nlms = NLMS(n_taps, mu=step_size)  # it has no regularization
+    return FilteredX(n_taps, path, lambda row, d: nlms.update(row[0], d), lambda: nlms.w)
+
+
+def _pyroomacoustics_rls(n_taps: int, path: np.ndarray, *, forgetting: float, initial_variance: float) -> FilteredX:
+    from pyroomacoustics.adaptive import RLS
+
+    rls = RLS(n_taps, lmbd=forgetting, delta=1.0 / initial_variance, dtype=np.float64)
+    return FilteredX(n_taps, path, lambda row, d: rls.update(row[0], d), lambda: rls.w)
+
+
+def _adafilt_nlms(n_taps: int, path: np.ndarray, *, step_size: float, regularization: float) -> FilteredX:
+    from adafilt import LMSFilter
+
+    lms = LMSFilter(n_taps, stepsize=step_size, epsilon_power=regularization)
+    return FilteredX(n_taps, path, lambda row, d: lms.adapt(row[0], d - lms.w @ row), lambda: lms.w)
+
+
+def _adafilt_rls(
+    n_taps: int, path: np.ndarray, *, state_noise: float, measurement_noise: float, initial_variance: float
+) -> FilteredX:
+    from adafilt import RLSFilter
+
+    rls = RLSFilter(
+        n_taps,
+        initial_covariance=initial_variance,
+        meas_noise_var=measurement_noise,
+        proc_noise_var=state_noise,
+    )
+    return FilteredX(n_taps, path, lambda row, d: rls.adapt(row[0], d - rls.w @ row), lambda: rls.w)
+
+
+def _aspsim_nlms(n_taps: int, path: np.ndarray, *, step_size: float, regularization: float) -> FilteredX:
+    from aspcore.adaptivefilter import LMS
+
+    lms = LMS(n_taps, 1, 1, step_size, regularization)
+    one = (1, 1)
+    return FilteredX(
+        n_taps,
+        path,
+        lambda row, d: lms.update(np.full(one, row[0]), np.full(one, d)),
+        lambda: lms.ir[0, 0],
+    )
+
+
+class AdafiltBlocks(BlockController):
+    """adafilt's `MultiChannelBlockLMS`, which is filtered-x LMS in blocks for any number of channels."""
+
+    def __init__(
+        self, task: Task, n_taps: int, path: np.ndarray, *, step_size: float, regularization: float, **_: Any
+    ) -> None:
+        from adafilt import MultiChannelBlockLMS
+
+        super().__init__(task)
+        self._s = path if path.ndim == 3 else path.reshape(1, 1, -1)
+        K, J, M = self._s.shape
+        self._lms = MultiChannelBlockLMS(
+            Nout=J,
+            Nin=self.n_references,
+            Nsens=K,
+            length=n_taps,
+            blocklength=task.block,
+            stepsize=step_size,
+            epsilon_power=2 * n_taps * regularization,  # of spectra of two filter lengths
+        )
+        self._past = np.zeros((self.n_references, M - 1))
+
+    def exchange(self, references: np.ndarray, errors: np.ndarray) -> np.ndarray:
+        """Return the control signals of a block, and adapt to its errors."""
+        y = self._lms.filt(references.T).T
+        x = np.concatenate((self._past, references), axis=1)
+        filtered = [[[np.convolve(one, s, "valid") for one in x] for s in row] for row in self._s]
+        self._past = x[:, references.shape[1] :]
+        self._lms.adapt(np.moveaxis(np.array(filtered), -1, 0), errors.T)
+        return y
+
+
+# ---- How they are tuned
+
+
+def _subfilters(task: Any, ratio: float, _: float) -> dict[str, Any]:
+    """Design the sub-filters by white noise through the plant, as when a system is set up."""
+    x = np.random.default_rng(0).standard_normal(round(DESIGN_S * task.fs))
+    design = wiener_solution(
+        x, np.convolve(task.primary, x)[: x.size], task.secondary, task.n_taps, regularization=DESIGN_RIDGE
+    )
+    q = task.measurement_noise
+    return {
+        "subfilters": band_subfilters(design.weights),
+        "state_noise": ratio * q / float(np.mean(task.disturbances[0] ** 2)),
+        "measurement_noise": q,
+        "rated_power": task.rated_power,
+        "fs": task.fs,
+    }
+
+
+def _subfilter_kalman(n_taps: int, path: np.ndarray, *, subfilters: np.ndarray, **settings: Any) -> SubfilterKalman:
+    return SubfilterKalman(subfilters, path, **settings)
+
+
+def _with_task(settings: Any) -> Any:
+    return lambda task, first, second: settings(task, first, second) | {"task": task}
+
+
+def own_entries() -> dict[str, Algorithm]:
+    """Return what this package enters beside its registry."""
+    return {
+        "sub-filter KF": Algorithm(
+            _subfilter_kalman, _subfilters, "ratio", "r E[d^2]/q", (1e-8, 1e-7, 1e-6, 1e-5)
+        )
+    }
+
+
+def peers() -> dict[str, Algorithm]:
+    """Return the entries of other packages that are installed, by the package's name, its version and the filter."""
+    own = algorithms()
+    nlms, rls, kalman = (
+        replace(own[name], first=grid, knows_amplifier=False, shares_gains=False, several_channels=False)
+        for name, grid in (("FxNLMS", STEPS), ("FxRLS", FORGOTTEN), ("KF-ANC", STATE_NOISES))
+    )
+    blocks = replace(
+        nlms,
+        make=lambda n_taps, path, task, **settings: AdafiltBlocks(task, n_taps, path, **settings),
+        settings=_with_task(nlms.settings),
+        several_channels=True,
+    )
+    made = {
+        ("padasip", "NLMS"): replace(nlms, make=_padasip_nlms),
+        ("padasip", "RLS"): replace(rls, make=_padasip_rls),
+        ("pyroomacoustics", "NLMS"): replace(nlms, make=_pyroomacoustics_nlms),
+        ("pyroomacoustics", "RLS"): replace(rls, make=_pyroomacoustics_rls),
+        ("adafilt", "NLMS"): replace(nlms, make=_adafilt_nlms),
+        ("adafilt", "RLS"): replace(kalman, make=_adafilt_rls),
+        ("adafilt", "block FxLMS"): blocks,
+        ("aspsim", "NLMS"): replace(nlms, make=_aspsim_nlms),
+    }
+    return {f"{package} {version(package)} {name}": own for (package, name), own in made.items() if find_spec(package)}
+
+
+def entries_for(task: Task, further: Mapping[str, Algorithm | str]) -> dict[str, Algorithm | str]:
+    """Return the package's entries and the `further` ones that take the channels of a task, as commands do."""
+    several = task.secondary.ndim == 3
+    fit = {name: own for name, own in further.items() if not several or getattr(own, "several_channels", True)}
+    return {**algorithms(several_channels=several), **fit}

@@ -1,0 +1,201 @@
+"""The tasks of the benchmark: files that say which paths, which noise, which rated power, and what changes.
+
+No signal is stored. A file names models of this package, or a public data set, and holds a hash of the signals that they
+gave: an entry is judged on these, or not at all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kfopc_filterpy import SimulationResult, bandpass_path, power_constrained_wiener
+from kfopc_filterpy.bench import Scene, make_scene
+from kfopc_filterpy.bench.scene import reachable_weights
+from kfopc_filterpy.controllers import Controller
+from kfopc_filterpy.paths import duct_paths, path_taps
+from kfopc_filterpy.signals import band_limited_noise, compressor_noise, looped, tone
+
+from ..studies.cases import Pair, measured_data, of_unit_gain
+from ..studies.multichannel_rooms import built_in_room
+
+FOLDER = Path(__file__).resolve().parent / "tasks"
+TUNED_ON, JUDGED_ON = 1, 2  # seeds
+DECIMALS = 4  # of what is hashed, over the rms: other machines round sums differently, far below that
+SENSOR_NOISE_DB, NSE_WINDOW_S = -40.0, 0.05
+
+
+class LeftOut(Exception):
+    """This machine lacks what a task needs."""
+
+
+@dataclass(frozen=True)
+class Task(Scene):
+    """A scene of two noises, one to tune on and one to be judged on, whose control signals are played a block later.
+
+    A sound card takes and gives whole blocks. So the secondary path begins with the delay of a block, for everyone.
+
+    Parameters
+    ----------
+    name, title : str
+        Name of the file, and what it is about.
+    digest : str
+        Hash of the definition; scores with the same one can be compared.
+    block : int
+        Samples of a block.
+    primary : ndarray
+        Primary path, for entries that are designed by a measurement of it.
+    changed_at_s : float
+        Time of the last change of the plant; 0 if nothing changes.
+    """
+
+    name: str = ""
+    title: str = ""
+    digest: str = ""
+    block: int = 0
+    primary: Any = None
+    changed_at_s: float = 0.0
+
+    def run(self, controller: Controller, seed_index: int = 0, **options: Any) -> SimulationResult:
+        """Run a controller; one with `plays_blocks` delays its control signal itself."""
+        if getattr(controller, "plays_blocks", False):
+            options["secondary_path"] = self.secondary[..., self.block :]
+        return super().run(controller, seed_index, **options)
+
+    def bound_db(self) -> float:
+        """Return the noise reduction of the best fixed filter within the rated power, over the half that counts."""
+        x, d = self.references[1], self.disturbances[1]
+        with reachable_weights():
+            bound = power_constrained_wiener(
+                x,
+                d,
+                self.secondary,
+                self.n_taps,
+                self.rated_power,
+                fs=self.fs,
+                switch_on_s=x.shape[-1] / self.fs / 2,
+            ).whole
+        left = np.mean(bound.error**2) + self.sensor_noise_std**2
+        return float(-10 * np.log10(left / np.mean(bound.stretch.d**2)))
+
+
+# ---- What a file names
+
+Noise = Callable[[int], np.ndarray]  # of a seed
+
+
+def _tones(duration_s: float, *, fs: float, frequencies_hz: list[float], floor_db: float, rng: int) -> np.ndarray:
+    """Return tones over white noise, which any real reference has."""
+    x = np.sum([tone(f, duration_s, fs=fs, phase_rad=f * rng) for f in frequencies_hz], axis=0)
+    floor = np.random.default_rng(rng).standard_normal(x.size)
+    return x + np.sqrt(np.mean(x**2)) * 10 ** (floor_db / 20) * floor
+
+
+def _recording(duration_s: float, *, fs: float, seconds_apart: float, rng: int) -> np.ndarray:
+    recording = _measured().noise
+    return looped(recording - recording.mean(), duration_s, fs=fs, start_s=seconds_apart * rng)
+
+
+def _measured() -> Any:
+    measured = measured_data()
+    if measured is None:
+        raise LeftOut("needs the measured data: set KFOPC_DATA, or fetch them with kfopc data fetch")
+    return measured
+
+
+def _bandpass(fs: float, *, band_hz: list[float], primary_taps: int, secondary_taps: int) -> Pair:
+    low, high = band_hz
+    return path_taps(bandpass_path(primary_taps, (low, high), fs=fs)), path_taps(
+        bandpass_path(secondary_taps, (low, high), fs=fs)
+    )
+
+
+def _duct(fs: float) -> Pair:
+    duct = duct_paths(fs=fs)
+    return path_taps(duct.primary), path_taps(duct.secondary)
+
+
+def _room(fs: float, *, loudspeakers: int) -> Pair:
+    if find_spec("pyroomacoustics") is None:
+        raise LeftOut('needs pyroomacoustics: python -m pip install -c constraints.txt -e ".[rooms]"')
+    room = built_in_room(loudspeakers)
+    return room.primary, room.secondary
+
+
+NOISES: dict[str, Callable[..., np.ndarray]] = {
+    "band": lambda duration_s, *, band_hz, **o: band_limited_noise(tuple(band_hz), duration_s, **o),
+    "compressor": compressor_noise,
+    "tones": _tones,
+    "recorded motor": _recording,
+}
+PATHS: dict[str, Callable[..., Pair]] = {
+    "band-pass": _bandpass,
+    "duct": _duct,
+    "room": _room,
+    "measured duct": lambda fs: of_unit_gain(_measured()),
+}
+
+
+# ---- From a file to a task
+
+
+def read_task(path: Path) -> Task:
+    """Return the task of a file; raise `LeftOut` if this machine lacks its data or a package."""
+    said = tomllib.loads(path.read_text(encoding="utf-8"))
+    fs, block = float(said["fs"]), int(said["block"])
+    primary, secondary = PATHS[said["paths"].pop("model")](fs, **said["paths"])
+    make = NOISES[said["noise"].pop("model")]
+    noises = {
+        seed: make(float(said["duration_s"]), fs=fs, rng=seed, **said["noise"]) for seed in (TUNED_ON, JUDGED_ON)
+    }
+    _require_same_signals(path, said["signals_sha256"], [primary, secondary, *noises.values()])
+    delayed = np.pad(secondary, [(0, 0)] * (secondary.ndim - 1) + [(block, 0)])
+    scene = make_scene(
+        {seed: noise if secondary.ndim == 1 else np.atleast_2d(noise) for seed, noise in noises.items()},
+        primary,
+        delayed,
+        fs=fs,
+        rated_power=said["rated_power"],
+        power_multiple=said["needed_power"],
+        n_taps=said["n_taps"],
+        switch_on_s=0.0,
+        sensor_noise_db=SENSOR_NOISE_DB,
+        nse_window_s=NSE_WINDOW_S,
+    )
+    change = said.get("change", {"at_s": 0.0, "primary_gain": 1.0})
+    for d in scene.disturbances:
+        d[..., round(change["at_s"] * fs) :] *= change["primary_gain"]
+    return Task(
+        **vars(scene),
+        name=path.stem,
+        title=said["title"],
+        digest=digest_of(path),
+        block=block,
+        primary=primary,
+        changed_at_s=change["at_s"],
+    )
+
+
+def digest_of(path: Path) -> str:
+    """Return the hash of a definition, which does not depend on comments and spaces."""
+    definition = json.dumps(tomllib.loads(path.read_text(encoding="utf-8")), sort_keys=True)
+    return hashlib.sha256(definition.encode()).hexdigest()[:12]
+
+
+def _require_same_signals(path: Path, expected: str, signals: list[np.ndarray]) -> None:
+    digest = hashlib.sha256()
+    for signal in signals:
+        digest.update(np.round(signal / np.sqrt(np.mean(signal**2)), DECIMALS).astype("<f4").tobytes())
+    if digest.hexdigest() != expected:
+        raise ValueError(
+            f"{path.name} was made for other signals: their hash is {digest.hexdigest()}, not {expected}. If a model was "
+            "changed on purpose, write this hash into the file; scores from before cannot be compared then"
+        )
