@@ -22,7 +22,7 @@ from kfopc_filterpy.controllers.channel_samples import ChannelFilters
 from .blocks import BlockController
 from .tasks import Task
 
-STEPS = (1.0, 0.25, 1 / 16, 1 / 64, 1 / 256)  # fewer than for our own: their samples take a hundred times as long
+STEPS = (1.0, 0.25, 1 / 16, 1 / 64)  # fewer than for our own: their samples take a hundred times as long
 FORGOTTEN = (1e-5, 1e-4, 1e-3)
 STATE_NOISES = (1e-7, 1e-6, 1e-5)
 DESIGN_S, DESIGN_RIDGE = 4.0, 1e-4  # of the white noise by which sub-filters are designed
@@ -194,11 +194,7 @@ def _with_task(settings: Any) -> Any:
 
 def own_entries() -> dict[str, Algorithm]:
     """Return what this package enters beside its registry."""
-    return {
-        "sub-filter KF": Algorithm(
-            _subfilter_kalman, _subfilters, "ratio", "r E[d^2]/q", (1e-8, 1e-7, 1e-6, 1e-5)
-        )
-    }
+    return {"sub-filter KF": Algorithm(_subfilter_kalman, _subfilters, "ratio", "r E[d^2]/q", STATE_NOISES)}
 
 
 def peers() -> dict[str, Algorithm]:

@@ -181,11 +181,17 @@ def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = Non
         prog="python -m comparisons benchmark", description="Run every entry on every task, and print the scores."
     )
     parser.add_argument(
-        "--entry", action="append", default=[], metavar="NAME=COMMAND", help="a command that speaks blocks (docs/benchmark.md)"
+        "--entry",
+        action="append",
+        default=[],
+        metavar="NAME=COMMAND",
+        help="a command that speaks blocks (docs/benchmark.md)",
     )
     parser.add_argument("--tasks", default="*", metavar="NAME", help="tasks whose name fits, such as 'duct-*'")
     parser.add_argument("--only", default="*", metavar="NAME", help="entries whose name fits, such as 'KF-*'")
-    parser.add_argument("--output", type=Path, default=Path("benchmark"), help="folder for benchmark.json (default: benchmark)")
+    parser.add_argument(
+        "--output", type=Path, default=Path("benchmark"), help="folder for benchmark.json (default: benchmark)"
+    )
     options = parser.parse_args(arguments)
     commands = dict(one.partition("=")[::2] for one in options.entry)
     for name, command in commands.items():
@@ -193,7 +199,9 @@ def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = Non
             parser.error(f"--entry must be NAME=COMMAND, got {name}={command}")
     files = [path for path in sorted(FOLDER.glob("*.toml")) if fnmatch(path.stem, options.tasks)]
     if not files:
-        parser.error(f"no task fits {options.tasks}; there are {', '.join(p.stem for p in sorted(FOLDER.glob('*.toml')))}")
+        parser.error(
+            f"no task fits {options.tasks}; there are {', '.join(p.stem for p in sorted(FOLDER.glob('*.toml')))}"
+        )
     try:
         prepare_folder(options.output)
     except OSError as error:

@@ -153,9 +153,7 @@ def read_task(path: Path) -> Task:
     fs, block = float(said["fs"]), int(said["block"])
     primary, secondary = PATHS[said["paths"].pop("model")](fs, **said["paths"])
     make = NOISES[said["noise"].pop("model")]
-    noises = {
-        seed: make(float(said["duration_s"]), fs=fs, rng=seed, **said["noise"]) for seed in (TUNED_ON, JUDGED_ON)
-    }
+    noises = {seed: make(float(said["duration_s"]), fs=fs, rng=seed, **said["noise"]) for seed in (TUNED_ON, JUDGED_ON)}
     _require_same_signals(path, said["signals_sha256"], [primary, secondary, *noises.values()])
     delayed = np.pad(secondary, [(0, 0)] * (secondary.ndim - 1) + [(block, 0)])
     scene = make_scene(

@@ -1,0 +1,207 @@
+"""The benchmark: its tasks, its scores against closed forms, peers against our own filters, and commands that fail."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.pages import ROOT
+
+from comparisons.benchmark import study, tasks
+from comparisons.benchmark.blocks import CommandController, EntryFailed
+from comparisons.benchmark.entries import own_entries, peers
+from comparisons.benchmark.tasks import FOLDER, LeftOut, Task, read_task
+from kfopc_filterpy import FxNLMS
+from kfopc_filterpy.bench import Algorithm, Runs, algorithms, make_controller
+from kfopc_filterpy.bench.registry import registered
+
+PAGE = (ROOT / "docs" / "benchmark.md").read_text(encoding="utf-8")
+PRINTED = (ROOT / "docs" / "benchmark.txt").read_text(encoding="utf-8")
+PYTHON = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)
+FILES = sorted(FOLDER.glob("*.toml"))
+
+
+@pytest.fixture(scope="module")
+def short() -> Task:
+    """A quarter of a second of band noise, with 16 taps."""
+    task = read_task(FOLDER / "bandpass.toml")
+    cut = [[signal[:2000] for signal in signals] for signals in (task.references, task.disturbances)]
+    return replace(task, references=cut[0], disturbances=cut[1], n_taps=16)
+
+
+# ---- Tasks
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_a_task_is_what_it_says(file: Path) -> None:
+    try:
+        task = read_task(file)
+    except LeftOut as error:
+        pytest.skip(str(error))
+    assert f"{task.name} [{task.digest}]: {task.title}" in PRINTED.splitlines()
+    assert not task.secondary[..., : task.block].any()
+    changed, whole = round(task.changed_at_s * task.fs), task.references[0].shape[-1]
+    assert changed < whole / 2  # the half that counts is after it
+
+
+def test_a_task_says_that_its_signals_are_no_longer_those_of_its_hash(tmp_path: Path) -> None:
+    text = FILES[0].read_text(encoding="utf-8")
+    other = tmp_path / "other.toml"
+    other.write_text(text + "\n# a comment\n", encoding="utf-8")
+    assert tasks.digest_of(other) == tasks.digest_of(FILES[0])
+    other.write_text(text.replace("1500.0", "1400.0"), encoding="utf-8")
+    assert tasks.digest_of(other) != tasks.digest_of(FILES[0])
+    with pytest.raises(ValueError, match=r"other.toml was made for other signals: their hash is [0-9a-f]{64}, not"):
+        read_task(other)
+
+
+def test_a_change_of_the_primary_path_is_heard_at_its_time() -> None:
+    steady, changed = (read_task(FOLDER / f"bandpass{name}.toml") for name in ("", "-change"))
+    ratio = changed.disturbances[1] / np.sqrt(2.0) / (steady.disturbances[1] / 2.0)  # the powers differ by 2 to 4
+    heard = np.abs(steady.disturbances[1]) > 1e-3
+    expected = np.where(np.arange(ratio.size) < 8000, 1.0, -1.0)
+    np.testing.assert_allclose(ratio[heard], expected[heard], rtol=1e-9)
+
+
+def test_a_task_without_its_data_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tasks, "measured_data", lambda: None)
+    with pytest.raises(LeftOut, match="set KFOPC_DATA"):
+        read_task(FOLDER / "measured-duct.toml")
+
+
+# ---- Scores
+
+
+def test_the_figures_of_a_made_up_run(short: Task) -> None:
+    """The error is d, and from 0.5 s on a tenth of it; one second is three times as loud as d."""
+    task = replace(short, changed_at_s=0.25)
+    d, fs = np.ones(8 * 8000), task.fs
+    e = np.where(np.arange(d.size) < 0.5 * fs, 1.0, 0.1)
+    e[2 * 8000 : 3 * 8000] = 3.0
+    y = np.full(d.size, np.sqrt(0.5))
+    result: Any = SimpleNamespace(error=e, disturbance=d, control_signal=y, diverged_at_s=None)
+    one = study.score(task, "made up", result, bound_db=23.0)
+    assert one.noise_reduction_db == pytest.approx(20.0)
+    assert one.below_bound_db == pytest.approx(3.0)
+    assert one.power == pytest.approx(0.5)
+    assert one.loudest_second_db == pytest.approx(20 * np.log10(3.0))
+    # 90 % of 20 dB are reached when 1 - 0.99 p of the window of 50 ms is 10^-1.8, p = 0.994: 397.7 samples
+    assert one.time_s == pytest.approx(0.25 + 397 / fs)
+    over = study.score(replace(task, rated_power=0.4), "made up", result, bound_db=23.0)
+    assert not over.within_rating
+    assert np.isnan(over.below_bound_db)
+
+
+# ---- Entries
+
+
+def test_filters_of_others_do_what_ours_do(short: Task) -> None:
+    """NLMS in the modified structure, RLS and the random walk are textbook recursions: equal to rounding."""
+    found, errors = peers(), {}
+    with registered(found):
+        for name, own in found.items():
+            package, _, kind = name.split(maxsplit=2)
+            errors[package, kind] = short.run(make_controller(short, name, own.first[1]), 1).error
+        ours = {name: short.run(make_controller(short, name, 1e-4), 1).error for name in ("FxRLS", "KF-ANC")}
+    for package in ("padasip", "aspsim"):
+        np.testing.assert_allclose(errors[package, "NLMS"], errors["adafilt", "NLMS"], atol=1e-9)
+    # These round otherwise over 2000 steps.
+    np.testing.assert_allclose(errors["padasip", "RLS"], ours["FxRLS"], atol=1e-6)
+    np.testing.assert_allclose(errors["pyroomacoustics", "RLS"], ours["FxRLS"], atol=1e-6)
+
+
+def test_every_entry_has_a_score_or_a_reason(short: Task, tmp_path: Path) -> None:
+    class Broken:
+        def __init__(self, n_taps: int, secondary_path: Any, **_: Any) -> None:
+            raise RuntimeError("out of order")
+
+    broken = Algorithm(Broken, lambda task, mu, _: {}, "mu", "mu", (0.1,))
+    entries = {**own_entries(), "broken": broken, "command": "no-such-program"}
+    outcome = study.run_task(Runs(), short, entries, only="[FKsbc]*")
+    scores = {one.entry: one for one in outcome["scores"]}
+    assert set(scores) == {*entries, *(name for name in algorithms() if name[0] in "FKsbc")}
+    failed = {name: one.failed for name, one in scores.items() if one.failed}
+    assert failed == {
+        "broken": "RuntimeError: out of order",
+        "command": "cannot be started: [Errno 2] No such file or directory: 'no-such-program'",
+    }
+    within = [one for one in outcome["scores"] if one.within_rating]
+    assert list(outcome["scores"][: len(within)]) == within
+    assert all(one.below_bound_db > -0.5 for one in within)  # an adaptive filter may follow the noise a little
+    assert scores["FxLMS"].cost == pytest.approx(1.0, abs=0.9)
+    assert "failed: RuntimeError: out of order" in study.table(outcome)
+
+
+# ---- Commands
+
+
+def command(tmp_path: Path, text: str) -> str:
+    file = tmp_path / "entry.py"
+    file.write_text(text, encoding="utf-8")
+    return f"{sys.executable} {file}"
+
+
+def test_the_command_of_the_page_gives_the_run_of_the_object(short: Task, tmp_path: Path, monkeypatch) -> None:
+    """Its blocks hold what a run sample by sample holds, because the secondary path begins with a block of zeros."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    (text,) = [text for text in PYTHON if "FxNLMS" in text]
+    assert len(text.strip().splitlines()) <= 12
+    with CommandController(short, command(tmp_path, text)) as entry:
+        blocks = short.run(entry, 1)
+    s, delay = short.known_secondary, short.block
+    own = short.run(FxNLMS(short.n_taps, s, step_size=0.1, regularization=1.0), 1)
+    np.testing.assert_allclose(blocks.error, own.error, atol=1e-9)
+    np.testing.assert_allclose(blocks.control_signal[delay:], own.control_signal[:-delay], atol=1e-9)
+
+
+def test_the_object_of_the_page_runs(short: Task, tmp_path: Path, monkeypatch, capsys) -> None:
+    (text,) = [text for text in PYTHON if "control_signal" in text]
+    monkeypatch.setattr(study, "read_task", lambda path: replace(short, name=path.stem))
+    monkeypatch.chdir(tmp_path)
+    exec(compile(text, "page", "exec"), {"__name__": "__main__"})
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("mine")]
+    assert rows
+    assert "failed" not in "".join(rows)
+    written = json.loads((tmp_path / "benchmark" / "benchmark.json").read_text(encoding="utf-8"))
+    assert "mine" in [one["entry"] for one in written["tasks"]["bandpass"]["scores"]]
+
+
+HEAD = "import sys, time\nread, write = sys.stdin.buffer.read, sys.stdout.buffer.write\nsys.stdin.buffer.readline()\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (
+            "raise SystemExit('no licence')",
+            r"answered 0 of 128 bytes in block 0 and ended with status 1: no licence|took",
+        ),
+        (HEAD + "read(256), write(bytes(64))", "answered 64 of 128 bytes in block 0 and ended with status 0"),
+        (HEAD + "read(256), write(b'\\xff' * 128), sys.stdout.flush(), read()", "answered NaN or Inf in block 0"),
+        (HEAD + "time.sleep(60)", "took longer than 3 s for a run"),
+        (HEAD + "while read(256): write(bytes(128)), sys.stdout.flush()\nwrite(b'more')", "answered 4 bytes more"),
+    ],
+)
+def test_a_command_that_fails_says_why(short: Task, tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(EntryFailed, match=says), CommandController(short, command(tmp_path, text), 3.0) as entry:
+        short.run(entry)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--tasks", "none"], "no task fits none; there are bandpass"),
+        (["--entry", "name"], "--entry must be NAME=COMMAND"),
+    ],
+)
+def test_the_command_line_says_what_is_wrong(arguments: list[str], says: str, capsys) -> None:
+    with pytest.raises(SystemExit):
+        study.main(arguments)
+    assert says in capsys.readouterr().err
