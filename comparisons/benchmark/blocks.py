@@ -81,7 +81,7 @@ class CommandController(BlockController):
         }
         self._blocks, self._timed_out, self._timeout_s = 0, False, timeout_s
         self._began, self.first_answer_s = time.perf_counter(), 0.0
-        self._complaints = tempfile.TemporaryFile()
+        self._complaints = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the command
         try:
             self._process = subprocess.Popen(
                 shlex.split(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._complaints

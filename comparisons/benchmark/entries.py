@@ -63,9 +63,8 @@ class FilteredX:
         return y
 
     def update(self, error: float) -> None:
-        """Let the filter adapt, once it has heard something: some divide by the energy of what they hear."""
-        if self._filtered.any():
-            self._adapt(self._filtered, float(error + self._played.output()[0]))
+        """Let the filter adapt to the disturbance that the error reveals."""
+        self._adapt(self._filtered, float(error + self._played.output()[0]))
 
 
 # ---- Filters of other packages
@@ -88,8 +87,13 @@ def _padasip_rls(n_taps: int, path: np.ndarray, *, forgetting: float, initial_va
 def _pyroomacoustics_nlms(n_taps: int, path: np.ndarray, *, step_size: float, regularization: float) -> FilteredX:
     from pyroomacoustics.adaptive import NLMS
 
-    nlms = NLMS(n_taps, mu=step_size)  # it has no regularization
-    return FilteredX(n_taps, path, lambda row, d: nlms.update(row[0], d), lambda: nlms.w)
+    nlms = NLMS(n_taps, mu=step_size)
+
+    def adapt(row: np.ndarray, d: float) -> None:
+        if row.any():  # it has no regularization, and divides by the energy of the row
+            nlms.update(row[0], d)
+
+    return FilteredX(n_taps, path, adapt, lambda: nlms.w)
 
 
 def _pyroomacoustics_rls(n_taps: int, path: np.ndarray, *, forgetting: float, initial_variance: float) -> FilteredX:

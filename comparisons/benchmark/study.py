@@ -16,8 +16,8 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult, __version__, noise_reduction_db, nse_db, output_power
 from kfopc_filterpy.bench import (
-    AllDivergedError,
     Algorithm,
+    AllDivergedError,
     Runs,
     make_controller,
     prepare_folder,
@@ -30,9 +30,8 @@ from kfopc_filterpy.bench.tuning import BUDGET
 
 from .blocks import CommandController, EntryFailed
 from .entries import entries_for, own_entries, peers
-from .tasks import FOLDER, JUDGED_ON, LeftOut, Task, read_task
+from .tasks import FOLDER, JUDGED, LeftOut, Task, read_task
 
-JUDGED = 1  # index of the seed
 SHARE = 0.9  # of the steady noise reduction, that is reached after a time
 TIMED_S, TIMES = 0.5, 5  # short runs are timed several times
 REFERENCE = ("FxLMS", 2.0**-6)  # whose cost a sample is 1
@@ -89,7 +88,7 @@ def score(task: Task, name: str, result: SimulationResult, bound_db: float) -> S
     e, d = np.atleast_2d(result.error), np.atleast_2d(result.disturbance)
     reduction = noise_reduction_db(e, d)
     power = float(np.max(output_power(result.control_signal) / task.rated_power))
-    seconds = np.array_split(np.arange(e.shape[1]), round(e.shape[1] / task.fs))
+    seconds = np.array_split(np.arange(e.shape[1]), max(round(e.shape[1] / task.fs), 1))
     loudest = max(-noise_reduction_db(e[:, part], d[:, part], steady=1.0) for part in seconds)
     change = round(task.changed_at_s * task.fs)
     curve = -nse_db(e, d, task.fs, task.nse_window_s)[change:]

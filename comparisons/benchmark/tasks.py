@@ -28,7 +28,8 @@ from ..studies.cases import Pair, measured_data, of_unit_gain
 from ..studies.multichannel_rooms import built_in_room
 
 FOLDER = Path(__file__).resolve().parent / "tasks"
-TUNED_ON, JUDGED_ON = 1, 2  # seeds
+SEEDS = (1, 2)  # of the noise to tune on, and of the one that is judged
+JUDGED = 1  # index of the latter
 DECIMALS = 4  # of what is hashed, over the rms: other machines round sums differently, far below that
 SENSOR_NOISE_DB, NSE_WINDOW_S = -40.0, 0.05
 
@@ -72,7 +73,7 @@ class Task(Scene):
 
     def bound_db(self) -> float:
         """Return the noise reduction of the best fixed filter within the rated power, over the half that counts."""
-        x, d = self.references[1], self.disturbances[1]
+        x, d = self.references[JUDGED], self.disturbances[JUDGED]
         with reachable_weights():
             bound = power_constrained_wiener(
                 x,
@@ -153,7 +154,7 @@ def read_task(path: Path) -> Task:
     fs, block = float(said["fs"]), int(said["block"])
     primary, secondary = PATHS[said["paths"].pop("model")](fs, **said["paths"])
     make = NOISES[said["noise"].pop("model")]
-    noises = {seed: make(float(said["duration_s"]), fs=fs, rng=seed, **said["noise"]) for seed in (TUNED_ON, JUDGED_ON)}
+    noises = {seed: make(float(said["duration_s"]), fs=fs, rng=seed, **said["noise"]) for seed in SEEDS}
     _require_same_signals(path, said["signals_sha256"], [primary, secondary, *noises.values()])
     delayed = np.pad(secondary, [(0, 0)] * (secondary.ndim - 1) + [(block, 0)])
     scene = make_scene(

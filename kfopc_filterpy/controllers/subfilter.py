@@ -211,7 +211,10 @@ class SubfilterKalman(BlockProcessing, Checkpointed):
             raise
 
     def listen(self, references: Any, errors: Any) -> None:
-        """Follow the noise before the control is switched on, with silent output; the gains stay as they are."""
+        """Follow `references`, (n_samples,), before the control is switched on; `errors` are not used.
+
+        The output is silent, and the gains stay as they are.
+        """
         for x in as_signal(references, "references"):
             self._hear(x)
             self._played.push(np.zeros(1))
