@@ -112,7 +112,7 @@ class CommandController(BlockController):
         """Return the controller."""
         return self
 
-    def __exit__(self, kind: Any, *_: Any) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """End the command, by the end of its input or, after a failure, by force."""
         try:
             if kind is None:

@@ -132,7 +132,7 @@ def run_entry(runs: Runs, task: Task, name: str, entry: Entry, bound_db: float, 
         return Score(name, failed="diverges at every setting")
     except EntryFailed as error:
         return Score(name, failed=str(error))
-    except Exception as error:  # of code that is not ours: the others go on
+    except Exception as error:  # noqa: BLE001 - of code that is not ours; the others go on
         return Score(name, failed=f"{type(error).__name__}: {error}")
     return replace(score(task, name, result, bound_db), cost=seconds / reference_s, setting=setting)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 from kfopc_filterpy import SimulationResult, bandpass_path, power_constrained_wiener
 from kfopc_filterpy.bench import Scene, make_scene
 from kfopc_filterpy.bench.scene import reachable_weights
-from kfopc_filterpy.controllers import Controller
+from kfopc_filterpy.controllers import Controller, CoreController
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.signals import band_limited_noise, compressor_noise, looped, tone
 
@@ -55,7 +55,9 @@ class Task(Scene):
     primary : ndarray
         Primary path, for entries that are designed by a measurement of it.
     changed_at_s : float
-        Time of the last change of the plant; 0 if nothing changes.
+        Time of the change of the plant; 0 if nothing changes.
+    secondary_gain : float
+        Factor by which the change multiplies the secondary path. Controllers know the path before it.
     """
 
     name: str = ""
@@ -64,12 +66,23 @@ class Task(Scene):
     block: int = 0
     primary: Any = None
     changed_at_s: float = 0.0
+    secondary_gain: float = 1.0
 
     def run(self, controller: Controller, seed_index: int = 0, **options: Any) -> SimulationResult:
         """Run a controller; one with `plays_blocks` delays its control signal itself."""
-        if getattr(controller, "plays_blocks", False):
-            options["secondary_path"] = self.secondary[..., self.block :]
-        return super().run(controller, seed_index, **options)
+        delay = self.block if getattr(controller, "plays_blocks", False) else 0
+        path: Any = self.secondary[..., delay:]
+        if self.secondary_gain != 1.0:
+            path = [(0.0, path), (self.changed_at_s, self.secondary_gain * path)]
+        return super().run(controller, seed_index, secondary_path=path, **options)
+
+    def run_together(
+        self, controllers: Sequence[CoreController], seed_index: int = 0, **options: Any
+    ) -> list[SimulationResult]:
+        """Run controllers that share their gains; one after the other if the secondary path changes."""
+        if self.secondary_gain == 1.0:
+            return super().run_together(controllers, seed_index, **options)
+        return [self.run(controller, seed_index, **options) for controller in controllers]
 
     def bound_db(self) -> float:
         """Return the noise reduction of the best fixed filter within the rated power, over the half that counts."""
@@ -78,7 +91,7 @@ class Task(Scene):
             bound = power_constrained_wiener(
                 x,
                 d,
-                self.secondary,
+                self.secondary_gain * self.secondary,
                 self.n_taps,
                 self.rated_power,
                 fs=self.fs,
@@ -169,7 +182,7 @@ def read_task(path: Path) -> Task:
         sensor_noise_db=SENSOR_NOISE_DB,
         nse_window_s=NSE_WINDOW_S,
     )
-    change = said.get("change", {"at_s": 0.0, "primary_gain": 1.0})
+    change = {"at_s": 0.0, "primary_gain": 1.0, "secondary_gain": 1.0} | said.get("change", {})
     for d in scene.disturbances:
         d[..., round(change["at_s"] * fs) :] *= change["primary_gain"]
     return Task(
@@ -180,6 +193,7 @@ def read_task(path: Path) -> Task:
         block=block,
         primary=primary,
         changed_at_s=change["at_s"],
+        secondary_gain=change["secondary_gain"],
     )
 
 

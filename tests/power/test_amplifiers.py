@@ -118,5 +118,7 @@ def test_a_subclass_is_called_not_replaced_by_its_parents_equation():
 
 
 def test_a_class_is_no_amplifier() -> None:
-    with pytest.raises(TypeError, match=r"amplifier must be an object, such as HardClipAmplifier\(limit=1\.0\), got <cl"):
+    with pytest.raises(
+        TypeError, match=r"amplifier must be an object, such as HardClipAmplifier\(limit=1\.0\), got <cl"
+    ):
         compiled_model(HardClipAmplifier)
