@@ -187,7 +187,7 @@ def assess(
         raise ValueError(
             "feedback=True takes neither primary nor disturbance: noise is the recording of the error microphones"
         )
-    x, d, s = recorded_signals(noise, primary, secondary, noise if feedback else disturbance, fs)
+    x, d, s = recorded_signals(noise, primary, secondary, noise if feedback else disturbance, fs, feedback)
     x = predictor_reference(d) if feedback else x
     p = None if primary is None else primary_paths(primary, fs=fs, name="primary")[0]
     several = s.ndim == 3
@@ -316,7 +316,12 @@ def assess(
 
 
 def recorded_signals(
-    noise: ArrayLike, primary: PathModels, secondary: PathModels, disturbance: ArrayLike | None, fs: float
+    noise: ArrayLike,
+    primary: PathModels,
+    secondary: PathModels,
+    disturbance: ArrayLike | None,
+    fs: float,
+    feedback: bool = False,
 ) -> tuple[np.ndarray, ...]:
     """Return references, disturbances and secondary paths, checked, the recordings without their offsets.
 
@@ -332,7 +337,8 @@ def recorded_signals(
             raise ValueError(
                 f"disturbance must have a channel for each of the {K} microphones of secondary, got {len(d)}"
             )
-        require_different("disturbance", d, "noise", x)
+        if not feedback:
+            require_different("disturbance", d, "noise", x)
     elif primary is None:
         raise ValueError("primary must be given unless there is a disturbance: what arrives at the error microphone?")
     else:

@@ -390,7 +390,8 @@ def _read_signals(
             "noise_level_db needs primary_path=, by which the disturbance follows; if you give the disturbance, scale "
             "both signals yourself, with signals.level_jump for example"
         )
-    x = x * noise_gain(noise_level_db, x.shape[1], fs, crossfade_s)
+    if noise_level_db != 0.0:
+        x = x * noise_gain(noise_level_db, x.shape[1], fs, crossfade_s)
 
     def read(paths: Any) -> np.ndarray:
         if several:

@@ -178,10 +178,10 @@ WHITE = {"innovations": np.ones((30, 1)), "S": np.ones((30, 1, 1))}
         ({**WHITE, "innovations": np.full((30, 1), np.inf)}, ValueError, "innovations must be finite"),
         ({**WHITE, "innovations": np.ma.masked_all((30, 1))}, ValueError, "all innovations are masked"),
         ({**WHITE, "coverage": 1.0}, ValueError, "coverage must be above 0 and below 1, got 1"),
-        ({**WHITE, "max_lag": 30}, ValueError, "more than max_lag = 30 samples, got 30; give a smaller max_lag"),
+        ({**WHITE, "max_lag": 30}, ValueError, "more than max_lag = 30 samples, got 30; lower max_lag"),
         ({**WHITE, "max_lag": 2.5}, TypeError, "max_lag must be a whole number"),
         ({**WHITE, "truth": np.ones((30, 1))}, ValueError, "give x= and P= beside truth="),
-        ({**WHITE, "truth": np.ones(30), "x": 1, "P": 1}, ValueError, "one column for each state"),
+        ({**WHITE, "truth": np.ones(30), "x": 1, "P": 1}, ValueError, "a column for each state"),
         ({**WHITE, "truth": np.ones((9, 1)), "x": np.ones((30, 1)), "P": WHITE["S"]}, ValueError, "truth must have"),
         ({**WHITE, "truth": np.ones((30, 1)), "x": np.ones((30, 2)), "P": WHITE["S"]}, ValueError, "x must have"),
         (

@@ -179,7 +179,7 @@ FAULTS: dict[str, tuple[Callable[[KFOPC], Any], type[Exception], str]] = {
     "no reference": (lambda kf: kf.update(np.ones(K), H=np.ones((K, N))), ValueError, "pass reference="),
     "NaN reference": (lambda kf: kf.update(np.ones(K), H=np.ones((K, N)), reference=[1.0, np.nan]), ValueError, "reference must be finite"),
     "three references": (lambda kf: kf.update(np.ones(K), H=np.ones((K, N)), reference=np.ones(3)), ValueError, r"2 loudspeaker\(s\) for 3 reference\(s\)"),
-    "two rows": (lambda kf: kf.update(np.ones(2), R=np.eye(2), H=np.ones((2, N)), reference=np.ones(2)), ValueError, "all measurements at once, dim_z = 3 rows of H, got 2"),
+    "two rows": (lambda kf: kf.update(np.ones(2), R=np.eye(2), H=np.ones((2, N)), reference=np.ones(2)), ValueError, "needs all dim_z = 3 measurements, rows of H, got 2"),
     "short batch": (lambda kf: kf.batch_filter([np.ones((K, 1))] * 3, references=np.ones((2, I))), ValueError, "references must have 3 values"),
 }  # fmt: skip
 

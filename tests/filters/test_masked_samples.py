@@ -182,7 +182,7 @@ def test_the_smoother_over_gaps_is_batch_least_squares() -> None:
 @pytest.mark.parametrize(
     ("z", "match"),
     [
-        (np.ma.array([1.0, 2.0], mask=[False, True]), r"z must have 3 value\(s\), the masked ones included"),
+        (np.ma.array([1.0, 2.0], mask=[False, True]), r"z must have 3 value\(s\), with the masked ones"),
         (np.ma.array([np.nan, 2.0, 0.0], mask=[False, False, True]), "z must be finite"),
     ],
 )

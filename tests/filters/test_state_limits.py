@@ -195,7 +195,7 @@ def test_the_price_of_KF_PB_is_this_limit_with_the_autocorrelation_matrix():
     ("limits", "error", "message"),
     [
         ({"upper": -1.0, "lower": 1.0}, ValueError, r"lower\[0\] = 1 must not be above upper\[0\] = -1"),
-        ({"upper": [1.0, 2.0]}, ValueError, r"upper must be one number or \(3,\), with inf for a state without one"),
+        ({"upper": [1.0, 2.0]}, ValueError, r"upper must be one number or \(3,\), inf for a state without one"),
         ({"upper": np.nan}, ValueError, "upper must be"),
         ({"lower": np.inf}, ValueError, "lower must be one number"),
         ({"equalities": np.eye(3)}, TypeError, r"equalities must be a pair of a matrix \(m, 3\)"),

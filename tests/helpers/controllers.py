@@ -40,8 +40,10 @@ from kfopc_filterpy import (
 from kfopc_filterpy.controllers import (
     FeedbackNeutralizer,
     KalmanObserver,
+    SubfilterKalman,
     VerifiedController,
     VirtualMicrophones,
+    band_subfilters,
     posterior,
     verified,
 )
@@ -258,6 +260,13 @@ AROUND: dict[str, Any] = {
     "FeedbackNeutralizer": lambda: FeedbackNeutralizer(quickly_verified(MAKERS["FxLMS"]()), [0.0, 0.1, 0.05]),
     "FeedbackNeutralizer, many": lambda: FeedbackNeutralizer(
         SEVERAL["kf_anc"](), random_paths(I, J, 3, seed=4), amplifier=HardClipAmplifier(0.7)
+    ),
+    "SubfilterKalman": lambda: SubfilterKalman(
+        band_subfilters(random_paths(1, 1, 12, seed=6)[0, 0], n_bands=3),
+        S_HAT,
+        state_noise=1e-6,
+        measurement_noise=1e-2,
+        rated_power=0.1,
     ),
     "VirtualMicrophones": lambda: VirtualMicrophones(
         FxLMS(L, PATHS[2:], step_size=MU, **MANY), PATHS, random_paths(1, 2, 3, seed=5), physical=[0, 1]
