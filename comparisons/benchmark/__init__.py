@@ -1,1 +1,1 @@
-"""The benchmark: tasks as files, entries as objects or as commands, one rule that tunes them, and their scores."""
+"""The benchmark: tasks as files, entries as objects or as commands, one rule that tunes the objects, and scores."""

@@ -1,4 +1,4 @@
-"""Entries that take and give whole blocks: the base class, and commands that speak blocks on stdin and stdout."""
+"""Entries that process whole blocks: the base class, and commands that exchange blocks on stdin and stdout."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ class BlockController(ABC):
 
     @abstractmethod
     def exchange(self, references: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        """Return the control signals y, (J, block), of the references (I, block), and take their errors (K, block)."""
+        """Return the control signals y, (J, block), for the references (I, block), and adapt to the errors (K, block)."""
 
     def control_signal(self, reference: Any) -> Any:
-        """Return the sample of the block that is played."""
+        """Return the current sample of the block that is being played, and store the reference."""
         self._heard[: self.n_references, self._n] = reference
         y = self._playing[:, self._n]
         return y.copy() if self._several else float(y[0])
 
     def update(self, error: Any) -> None:
-        """Hear the error, and exchange the block if it is full."""
+        """Store the error, and exchange the block if it is full."""
         self._heard[self.n_references :, self._n] = error
         self._n += 1
         if self._n == self._heard.shape[1]:
@@ -57,7 +57,7 @@ class BlockController(ABC):
 
 
 class EntryFailed(RuntimeError):
-    """A command ended, was silent for too long, or answered what is no block."""
+    """A command ended early, took too long, or gave an answer that is no block of finite numbers."""
 
 
 class CommandController(BlockController):
@@ -150,7 +150,7 @@ class CommandController(BlockController):
             raise self._failure("took no input") from None
 
     def _failure(self, what: str) -> EntryFailed:
-        """Return why the command did not do its part; its output has ended, so it has ended or soon will."""
+        """Return why the command failed; its output has ended, so it has ended or soon will."""
         if self._timed_out:
             return EntryFailed(f"took longer than {self._timeout_s:g} s for a run")
         try:

@@ -1,7 +1,7 @@
-"""The entries: the algorithms of this package, and adaptive filters of others, whose code is used as it is installed.
+"""The entries: the algorithms of this package, and adaptive filters of other packages, used as installed.
 
-Filters of other packages are made for system identification or for filtered-x LMS. Each gets the structure that its
-interface asks for, a setting from a grid of its own, and the rule that tunes all.
+Filters of other packages are made for system identification or for filtered-x LMS. Each is put into the structure that its
+interface requires, has its own grid of settings, and is tuned by the rule for all.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from kfopc_filterpy.controllers.channel_samples import ChannelFilters
 from .blocks import BlockController
 from .tasks import Task
 
-STEPS = (1.0, 0.25, 1 / 16, 1 / 64)  # fewer than for our own: their samples take a hundred times as long
+STEPS = (1.0, 0.25, 1 / 16, 1 / 64)  # fewer than for our own: a sample takes more than a hundred times as long
 FORGOTTEN = (1e-5, 1e-4, 1e-3)
 STATE_NOISES = (1e-7, 1e-6, 1e-5)
 DESIGN_S, DESIGN_RIDGE = 4.0, 1e-4  # of the white noise by which sub-filters are designed
@@ -197,12 +197,12 @@ def _with_task(settings: Any) -> Any:
 
 
 def own_entries() -> dict[str, Algorithm]:
-    """Return what this package enters beside its registry."""
+    """Return the entries of this package that are not in its registry."""
     return {"sub-filter KF": Algorithm(_subfilter_kalman, _subfilters, "ratio", "r E[d^2]/q", STATE_NOISES)}
 
 
 def peers() -> dict[str, Algorithm]:
-    """Return the entries of other packages that are installed, by the package's name, its version and the filter."""
+    """Return the entries of the other packages that are installed, named by package, version and filter."""
     own = algorithms()
     nlms, rls, kalman = (
         replace(own[name], first=grid, knows_amplifier=False, shares_gains=False, several_channels=False)
@@ -228,7 +228,7 @@ def peers() -> dict[str, Algorithm]:
 
 
 def entries_for(task: Task, further: Mapping[str, Algorithm | str]) -> dict[str, Algorithm | str]:
-    """Return the package's entries and the `further` ones that take the channels of a task, as commands do."""
+    """Return the registry's entries and the `further` ones that take the channels of a task; commands take any."""
     several = task.secondary.ndim == 3
     fit = {name: own for name, own in further.items() if not several or getattr(own, "several_channels", True)}
     return {**algorithms(several_channels=several), **fit}

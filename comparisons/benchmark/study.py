@@ -47,18 +47,18 @@ class Score:
     entry : str
         Its name.
     noise_reduction_db : float
-        Noise reduction over the steady half in dB.
+        Noise reduction over the second half of the run in dB.
     below_bound_db : float
-        How far that is below the bound in dB; NaN if the rated power is not kept.
+        By how many dB that is below the bound; NaN if the rated power is not kept.
     power : float
-        Output power over the steady half, over the rated one, of the loudspeaker for which this is largest.
+        Output power over that half, divided by the rated power, of the loudspeaker for which this is largest.
     loudest_second_db : float
-        Power of the error over that of the disturbance in dB, in the second in which this is largest.
+        Power of the error relative to that of the disturbance in dB, in the second in which this is largest.
     time_s : float
         Time from the last change of the plant until 90 % of the steady noise reduction in dB is reached; NaN if the noise
         is not reduced.
     cost : float
-        Processor time of a run, over that of FxLMS; of a command, the time that passes.
+        Processor time of a run, divided by that of FxLMS; for a command, the elapsed time divided by the same.
     setting : float or tuple of float, optional
         Its best setting.
     failed : str
@@ -105,7 +105,7 @@ def score(task: Task, name: str, result: SimulationResult, bound_db: float) -> S
 
 
 def timed(run: Callable[[], Any]) -> tuple[Any, float]:
-    """Return what a run gives, and its processor time in s, the best of several if it is short."""
+    """Return the result of a run and its processor time in s, the shortest of several if it is short."""
     best, spent, done = np.inf, 0.0, 0
     while done == 0 or (spent < TIMED_S and done < TIMES):
         began = time.thread_time()
@@ -185,7 +185,7 @@ def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = Non
         action="append",
         default=[],
         metavar="NAME=COMMAND",
-        help="a command that speaks blocks (docs/benchmark.md)",
+        help="a command that exchanges blocks (docs/benchmark.md)",
     )
     parser.add_argument("--tasks", default="*", metavar="NAME", help="tasks whose name fits, such as 'duct-*'")
     parser.add_argument("--only", default="*", metavar="NAME", help="entries whose name fits, such as 'KF-*'")

@@ -1,7 +1,7 @@
 """The tasks of the benchmark: files that say which paths, which noise, which rated power, and what changes.
 
-No signal is stored. A file names models of this package, or a public data set, and holds a hash of the signals that they
-gave: an entry is judged on these, or not at all.
+No signal is stored. A file names models of this package, or a public data set, and holds a hash of the signals that
+these gave: if they give others now, the task is refused.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ class LeftOut(Exception):
 class Task(Scene):
     """A scene of two noises, one to tune on and one to be judged on, whose control signals are played a block later.
 
-    A sound card takes and gives whole blocks. So the secondary path begins with the delay of a block, for everyone.
+    A sound card takes and gives whole blocks. So the secondary path begins with the delay of a block for every entry.
 
     Parameters
     ----------
     name, title : str
-        Name of the file, and what it is about.
+        Name of the file, and what the task is about.
     digest : str
         Hash of the definition; scores with the same one can be compared.
     block : int
@@ -198,7 +198,7 @@ def read_task(path: Path) -> Task:
 
 
 def digest_of(path: Path) -> str:
-    """Return the hash of a definition, which does not depend on comments and spaces."""
+    """Return the hash of a definition, regardless of comments and spaces."""
     definition = json.dumps(tomllib.loads(path.read_text(encoding="utf-8")), sort_keys=True)
     return hashlib.sha256(definition.encode()).hexdigest()[:12]
 

@@ -9,10 +9,10 @@ from .._validate import as_channels
 
 
 def predictor_reference(disturbance: ArrayLike) -> np.ndarray:
-    r"""Return the reference of a feedback controller whose internal model is exact: the disturbance a sample late.
+    r"""Return the reference of a feedback controller whose internal model is exact: the disturbance one sample late.
 
-    With it, every bound of this package is one on feedback control, such as `power_constrained_wiener`: its control filter
-    w, followed by the secondary path, is the best predictor of d(n) from d(n - 1), d(n - 2), ... within the power.
+    With it, every bound of this package, such as `power_constrained_wiener`, applies to feedback control: the control filter
+    w, followed by the secondary path, is the best predictor of d(n) from d(n - 1), d(n - 2), ... within the rated power.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ def predictor_reference(disturbance: ArrayLike) -> np.ndarray:
     Returns
     -------
     ndarray, of the same shape
-        ``x(n) = d(n - 1)``, and 0 first. For hybrid control, stack it below the references of the microphones.
+        ``x(n) = d(n - 1)``, and 0 as the first sample. For hybrid control, stack it below the references of the microphones.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def predictor_reference(disturbance: ArrayLike) -> np.ndarray:
 
     Examples
     --------
-    An AR(1) disturbance with a pole at 0.9, and a loudspeaker that is heard two samples late: a predictor over three
+    An AR(1) disturbance with a pole at 0.9, and a loudspeaker that is heard two samples late: a prediction over three
     samples leaves ``1 - 0.9^6`` of the power.
 
     >>> import numpy as np

@@ -21,8 +21,8 @@ MOST_EXCESS = 3.0  # relative to the limit, in a step of the prices
 class BandLimitedFxLMS(FrequencyDomainFxLMS):
     r"""Frequency-domain FxLMS within a power limit for each frequency band of the control signal.
 
-    A band whose limit is exceeded gets a price, which the step of its bins takes account of; the other bands adapt as
-    without limits. With the spectrum Y of the block's control signal, the powers :math:`p_b` in the bands, their limits
+    A band whose limit is exceeded gets a price :math:`\lambda_b`, the weight of a penalty on its power (a Lagrange
+    multiplier). The other bands adapt as without limits. With the spectrum Y of the block's control signal, the powers :math:`p_b` in the bands, their limits
     :math:`\rho_b` and the gain :math:`G_b = E|X'|^2 / E|X|^2` in a band,
 
     .. math:: W \leftarrow W + \mu\, C\big\{M\, C\{M^* (X'^* E - \lambda X^* Y)\}\big\}, \qquad
@@ -38,10 +38,11 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
     n_taps, secondary_path, step_size, block_size, partition_size, n_references
         As for `FrequencyDomainFxLMS`.
     band_edges : array_like, shape (n_bands + 1,)
-        Edges of adjacent bands in Hz, rising, from 0 to fs/2 at most. A band needs at least one bin: they are
-        ``fs / (N + B)`` apart. Bins outside all bands have no limit.
+        Edges of adjacent bands in Hz, rising, within 0 to fs/2. A band must be at least as wide as the spacing of the
+        bins, ``fs / (N + B)``. Bins outside all bands have no limit.
     band_powers : array_like, shape (n_bands,) or (J, n_bands)
-        Power limit of the control signal, or of each, in each band, above zero; a mean square.
+        Power limit (mean square) of the control signal in each band, above zero; (J, n_bands) gives each loudspeaker its
+        own.
     fs : float, default 16000
         Sample rate in Hz.
     forgetting : float, default 0.9
@@ -55,8 +56,8 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
     Raises
     ------
     ValueError
-        As for `FrequencyDomainFxLMS`; edges that do not rise or leave the range; a band without a bin; limits that are
-        not positive or have another shape.
+        As for `FrequencyDomainFxLMS`; edges that do not rise or leave the range; a band that is too narrow; limits that
+        are not positive or have another shape.
 
     Notes
     -----
@@ -68,13 +69,13 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
     W. J. Kozacky, T. Ogunfunmi, "An active noise control algorithm with gain and power constraints on the adaptive
     filter", EURASIP Journal on Advances in Signal Processing 2013:17; B. Rafaely, S. J. Elliott, "A computationally
     efficient frequency-domain LMS algorithm with constraints on the adaptive filter", IEEE Trans. Signal Processing
-    48(6), 2000. Of the first, the abstract and the introduction were available: penalty functions on the power in each
-    bin of a frequency-domain LMS. With a penalty of fixed weight, the power exceeds its limit by what the weight decides;
-    here the weight of each band is integrated until the limit is met.
+    48(6), 2000. Only the abstract and the introduction of the first were available; it has penalty functions on the
+    power in each bin of a frequency-domain LMS. With a penalty of fixed weight, the power exceeds its limit by an amount that
+    depends on the weight; here the weight of each band is integrated until the limit is met.
 
     Examples
     --------
-    White noise that needs a power of 0.5 in each half of the spectrum, and may have half of that in the upper one:
+    White noise whose cancellation takes a power of 0.5 in each half of the spectrum; the upper half may have half of that:
 
     >>> import numpy as np
     >>> from kfopc_filterpy import BandLimitedFxLMS, simulate
@@ -135,7 +136,7 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
 
     @property
     def band_powers(self) -> np.ndarray:
-        """Power limits of the bands, (n_bands,) or (J, n_bands); a copy. Others can be assigned at any time."""
+        """Power limits of the bands, (n_bands,) or (J, n_bands); a copy. New limits can be assigned at any time."""
         return self._of_bands(self._limits)
 
     @band_powers.setter
@@ -152,7 +153,7 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
 
     @property
     def rated_power(self) -> NumberOrArray:
-        """Sum of the limits of all bands, with several channels (J,). Assigning another one scales the limits."""
+        """Sum of the limits of all bands, with several channels (J,). Assigning another sum scales the limits."""
         total = self._limits.sum(axis=1)
         return total if self.multichannel else float(total[0])
 

@@ -14,14 +14,14 @@ from .channel_samples import LOUDEST, require_moderate
 from .channels import Channels
 from .processing import BlockProcessing, adapt_flags, output_array, require_apart, require_one_length, takes_none
 
-LOUDEST_ERROR = 1e100  # as loud as the weights that are kept can make it, so that it can fall again
+LOUDEST_ERROR = 1e100  # above what weights up to MOST_WEIGHT can cause, so that they can adapt down again
 MOST_WEIGHT = 1e80  # a step that leads beyond it is left out
 ROUNDING = 1e-12  # -120 dB; rounding errors are at -300 dB
 TINY = float(np.finfo(float).tiny)
 
 
 class BlockController(Channels, BlockProcessing, Checkpointed):
-    r"""Base class of the block controllers: the control filter stays as it is for B samples, then `_adapt` changes it.
+    r"""Base class of the block controllers: they keep the control filter for B samples, then `_adapt` changes it.
 
     The control filter is kept as spectra of P partitions with N taps each. A block of B samples is filtered by overlap-save
     with transforms of N + B samples. The control signal has no delay: what the samples before the block contribute to it
@@ -32,7 +32,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
     Parameters
     ----------
     n_taps : int
-        Taps L of the control filter, or of each of them.
+        Taps L of the control filter, or of each control filter.
     secondary_path : array_like, shape (taps,) or (K, J, taps), or control system
         Estimated secondary path, as for `FxLMS`.
     block_size : int
@@ -93,8 +93,8 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
     def secondary_path(self) -> np.ndarray:
         """Estimated secondary path s^, (n_path,), or with several channels (K, J, n_path); a copy.
 
-        A new estimate can be assigned between two samples: taps or an FIR system, or paths with the same channels, no
-        longer than the present estimate. The stored references are filtered again with it; the weights stay.
+        A new estimate can be assigned between two samples: taps or an FIR system, with several channels as many paths
+        as before, and no longer than the present estimate. The stored references are filtered again with it; the weights stay.
         """
         return self._path.copy()
 
@@ -105,7 +105,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
             self._X_filtered[..., back, :] = self._filtered_spectrum(back)
 
     def _filtered_spectrum(self, back: int = 0) -> np.ndarray:
-        """Return the spectrum of the filtered references at the end of a block, so many blocks back, (K, J, I, bins)."""
+        """Return the spectrum of the filtered references at the end of the block `back` blocks ago, (K, J, I, bins)."""
         end = self._references.shape[1] - back * self.block_size
         x = rfft(self._references[:, end - self._window : end])
         return rfft(self._newest(irfft(x * self._S, self._window)))
@@ -135,7 +135,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         return rfft(partitions, self.partition_size + self.block_size)
 
     def _block_spectrum(self, block: np.ndarray) -> np.ndarray:
-        """Return the spectra of blocks (..., B) of which the samples before are zero."""
+        """Return the spectra of blocks (..., B) with zeros in place of the samples before them."""
         return rfft(np.concatenate((np.zeros((*block.shape[:-1], self.partition_size)), block), axis=-1))
 
     def _block_of(self, spectra: np.ndarray) -> np.ndarray:
@@ -143,7 +143,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         return irfft(spectra, self.partition_size + self.block_size)[..., self.partition_size :]
 
     def _adapt(self) -> None:
-        """Replace the control filter's spectra after a block, of which at least one error was taken."""
+        """Replace the control filter's spectra after a block in which at least one error was taken."""
         raise NotImplementedError
 
     def _follow(self) -> None:
@@ -176,7 +176,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
 
     def _emit(self, x: np.ndarray) -> np.ndarray:
         """Return the control signals for samples (I, n) that lie within a block, (J, n)."""
-        if self._n == self.block_size:  # without an error of its last sample
+        if self._n == self.block_size:  # the error of its last sample was not taken
             self._end_block()
         begin, end = self._n, self._n + x.shape[1]
         self._now[:, self.block_size - 1 + begin : self.block_size - 1 + end] = x
@@ -189,7 +189,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         return y
 
     def emitted(self, control_signal: float) -> None:
-        """Take `control_signal`, what a limiter made of the last one; `LimitedController` calls this."""
+        """Take what a limiter made of the last control signal; `LimitedController` calls this."""
         self._played[:, self._n - 1] = control_signal
 
     def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
@@ -220,13 +220,13 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         adapt: bool | ArrayLike = True,
         out: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
+        """Return the control signals for a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
         takes_none(self, references)
         x = self._block_signal(references, "references", self.n_references)
         e = self._block_signal(errors, "errors", self.n_microphones)
         loud = np.abs(x).max() > LOUDEST or np.abs(e).max() > LOUDEST_ERROR
         if loud or calls_of(type(self)) != calls_of(BlockController):
-            return super().process(x, e, adapt=adapt, out=out)  # as far as the sample that is refused
+            return super().process(x, e, adapt=adapt, out=out)  # up to the sample that is refused
         require_one_length(x, e)
         flags = adapt_flags(adapt, x.shape[-1])
         require_apart(out, x, e)

@@ -22,10 +22,10 @@ class FrequencyDomainFxLMS(BlockController):
     .. math:: W_p \leftarrow W_p + \mu\, C\big\{M\, C\{M^* X_p'^* E\}\big\}, \qquad
        |M|^2 = \frac{1}{\Lambda}, \qquad \Lambda = \sum_p |X'_p|^2
 
-    C is the gradient constraint: back to time, the taps beyond the partition set to zero. M is causal, the minimum-phase
+    C is the gradient constraint: in the time domain, the taps beyond the partition are set to zero. M is causal, the minimum-phase
     factor of the step. With it, all bins converge at about the same rate, whatever the colour of the noise, and the
-    weights settle at the best causal filter; a step :math:`1/\Lambda` in one piece would also weigh what no causal filter
-    can cancel. Without M this is exactly the block LMS, :math:`w \leftarrow w + \mu \sum_n e(n)\, x'(n)`.
+    weights settle at the best causal filter; a step :math:`1/\Lambda` applied at once would also weight what no
+    causal filter can cancel. Without M this is exactly the block LMS, :math:`w \leftarrow w + \mu \sum_n e(n)\, x'(n)`.
 
     Parameters
     ----------
@@ -34,17 +34,17 @@ class FrequencyDomainFxLMS(BlockController):
     step_size : float
         Step size mu, above zero; below 1 unless `forgetting` is None.
     block_size : int
-        Samples B of a block. The weights follow a change no sooner than its end.
+        Samples B of a block. The weights follow a change no sooner than at the end of a block.
     partition_size : int, optional
-        Taps N of a partition, a multiple of B; by default B. One partition has at least `n_taps`. For the block LMS, the
-        result does not depend on it.
+        Taps N of a partition, a multiple of B; by default B. With at least `n_taps`, there is one partition. The result of the
+        block LMS does not depend on it.
     constrained : bool, default True
-        False leaves out C except in the first partition, which the control signal without delay needs. This saves most
+        False leaves out C except in the first partition, where the delayless control signal needs it. This saves most
         of the transforms. But each partition then also has taps that repeat those of its neighbours (`weights` leaves
         them out) and vary within a block, so the secondary path must be much shorter than a block, and the weights settle
         only near the best filter.
     forgetting : float or None, default 0.9
-        Forgetting factor, per block, of the powers :math:`\Lambda`; None: the block LMS, without M.
+        Forgetting factor, per block, of the powers :math:`\Lambda`. None gives the block LMS, without M.
 
     Attributes
     ----------

@@ -15,8 +15,8 @@ from .frequency_domain import FrequencyDomainFxLMS
 class FrequencyDomainKalman(FrequencyDomainFxLMS):
     r"""Partitioned-block frequency-domain Kalman filter: frequency-domain FxLMS with the Kalman gain as its step.
 
-    The spectra :math:`W_p` of the control filter's partitions are the state. Their errors are taken to be independent,
-    with a variance :math:`P_p` in each bin, and to grow between the blocks. With :math:`X'_p` the spectra of the filtered
+    The spectra :math:`W_p` of the control filter's partitions are the state. Their errors are assumed to be independent,
+    with a variance :math:`P_p` in each bin, and to grow from block to block. With :math:`X'_p` the spectra of the filtered
     reference, E that of :math:`\hat d - w^T x'` in the block, its mean power :math:`\Psi`, and :math:`b = B/(N+B)`,
 
     .. math:: P_p \leftarrow A^2 P_p + (1 - A^2) |W_p|^2, \qquad
@@ -41,7 +41,7 @@ class FrequencyDomainKalman(FrequencyDomainFxLMS):
     Raises
     ------
     ValueError
-        As for `FrequencyDomainFxLMS`; a path of several channels; a factor that is not positive, or above 1.
+        As for `FrequencyDomainFxLMS`; a path of several channels; a factor that is not positive or is above 1.
 
     Notes
     -----
@@ -51,7 +51,7 @@ class FrequencyDomainKalman(FrequencyDomainFxLMS):
     ----------
     G. Enzner, P. Vary, "Frequency-domain adaptive Kalman filter for acoustic echo control in hands-free telephones",
     Signal Processing 86(6), 2006. F. Kuech, E. Mabande, G. Enzner, "State-space architecture of the partitioned-block-based
-    acoustic echo controller", ICASSP 2014. Both take the gain in one piece; for its factors M, see
+    acoustic echo controller", ICASSP 2014. Both apply the gain at once; for its factors M, see
     `FrequencyDomainFxLMS`.
 
     Examples

@@ -13,18 +13,18 @@ _Made = TypeVar("_Made", bound=CoreController)
 def with_internal_model(controller: _Made) -> _Made:
     r"""Return a controller as a feedback controller, or with reference microphones as a hybrid one.
 
-    The internal model computes the disturbance from the error and from what the loudspeakers play. Its last sample is a
-    reference of the controller, one for each error microphone:
+    The internal model computes the disturbance at each error microphone from the error there and from what the loudspeakers
+    play. Its last sample is a reference of the controller:
 
     .. math:: x_k(n) = \hat d_k(n - 1), \qquad \hat d_k(n) = e_k(n) + \sum_j (\hat s_{kj} * y_j)(n)
 
     The error e(n) is only known after y(n) has been played, so the newest sample is that of n - 1. With an exact estimate
     of the secondary path, the controller is that of a feedforward system whose reference is d(n - 1): it predicts the
     disturbance over the delay of the secondary path. Otherwise, the error of the estimate closes a loop through the
-    control filter; `paths.internal_model_margin` says which error this loop stands.
+    control filter; `paths.internal_model_margin` says which error this loop tolerates.
 
-    This is not what `FeedbackNeutralizer` is for: that one removes the sound of the loudspeakers from a reference
-    microphone (acoustic feedback).
+    This is not what `FeedbackNeutralizer` is for: that class removes the sound of the loudspeakers from the signal
+    of a reference microphone (acoustic feedback).
 
     Parameters
     ----------
@@ -43,13 +43,13 @@ def with_internal_model(controller: _Made) -> _Made:
     TypeError
         An object that is not a `CoreController`: a wrapper (wrap the result instead), or a controller in plain Python.
     ValueError
-        A controller with fewer references than error microphones, or one that has an internal model.
+        A controller with fewer references than error microphones, or one that already has an internal model.
 
     Notes
     -----
-    The weights, (J, I + K, L), have those for the disturbances last. An error that is refused, or never given, counts as
-    silence: the next reference is 0. If a limiter or a known amplifier changes the control signal, the model computes with
-    what it makes of it. `process` takes the errors of samples with ``adapt=False`` as references, too.
+    In the weights, (J, I + K, L), those for the disturbances come last. An error that is refused, or never given, counts as
+    silence: the next reference is 0. If a limiter or a known amplifier changes the control signal, the model uses
+    the signal that results. `process` takes the errors of samples with ``adapt=False`` as references, too.
 
     References
     ----------
@@ -76,7 +76,9 @@ def with_internal_model(controller: _Made) -> _Made:
             "the controller, or subtract s^ * y in your own update"
         )
     if controller.internal_model:
-        raise ValueError(f"{controller.name} has an internal model")
+        raise ValueError(
+            f"{controller.name} already has an internal model: pass the controller that was made without one"
+        )
     if controller.n_references < controller.n_microphones:
         raise ValueError(
             f"controller must have a reference for each of the {controller.n_microphones} error microphones, which the "

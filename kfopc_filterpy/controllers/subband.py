@@ -31,7 +31,7 @@ class SubbandFxLMS(BlockController):
     n_taps, secondary_path, n_references
         As for `FxLMS`. `n_taps` must be a multiple of M.
     step_size : float
-        Step size mu of a block, above zero and below 1; each of its subband samples has an equal share of it.
+        Step size mu of a block, above zero and below 1; each subband sample of the block takes an equal share of it.
     n_bands : int
         Number M of bands, even. `n_bands // 2 + 1` of them differ, because the signals are real.
     block_size : int
@@ -41,20 +41,21 @@ class SubbandFxLMS(BlockController):
     ------
     ValueError
         A step size that is not positive and finite; sizes below 1; an odd number of bands; `n_taps` or `block_size` that
-        is not such a multiple; a path that is not FIR.
+        is not the multiple stated above; a path that is not FIR.
 
     Notes
     -----
-    The prototype of the bank is a low-pass filter of 4 M taps. The errors are heard through the bank, which delays the
-    adaptation by 2 M samples; this limits the step size. A filter in a band is as long as the control filter, but a
-    response between two bands, or a delay that is no multiple of M/2, needs taps beyond it. So the weights settle near
-    the best filter, not at it. Of a new `secondary_path`, it knows nothing but that after L + 4 M samples. For a limiter, wrap it in a `LimitedController`.
+    The prototype of the bank is a low-pass filter of 4 M taps. The errors pass the bank, which delays the adaptation by
+    2 M samples; this limits the step size. The filter of a band lasts as long as the control filter, but a response between
+    two bands, or a delay that is no multiple of M/2, needs taps beyond that. So the weights settle near the best filter, not
+    at it. For L + 4 M samples after a new `secondary_path` is assigned, the stored references of the bands still include the
+    old one. To limit the control signal, wrap the controller in a `LimitedController`.
 
     References
     ----------
     D. R. Morgan, J. C. Thi, "A delayless subband adaptive filter architecture", IEEE Trans. Signal Processing 43(8),
-    1995: the structure, and the stacking of the spectra; their bin at fs/2 is zero, here it is kept, which a short filter
-    needs. S. J. Park, J. H. Yun, Y. C. Park, D. H. Youn, "A delayless
+    1995: the structure, and the stacking of the spectra; there the bin at fs/2 is zero; here it is kept, because a short
+    filter needs it. S. J. Park, J. H. Yun, Y. C. Park, D. H. Youn, "A delayless
     subband active noise control system for wideband noise control", IEEE Trans. Speech and Audio Processing 9(8), 2001,
     models the secondary path in the bands; here the reference is filtered in the full band, by Fourier transforms.
 

@@ -71,16 +71,16 @@ class SubfilterKalman(BlockProcessing, Checkpointed):
     .. math:: y = \sum_c g_c\,(w_c * x), \qquad \hat d = \sum_c g_c\,(\hat s * w_c * x) + \text{noise}
 
     The gains are a random walk (eq. 1-8 with the filtered outputs of the sub-filters as the row). There are far fewer
-    of them than taps, so they are found in some tens of milliseconds. The noise reduction is limited by what the
+    gains than taps, so they are found within some tens of milliseconds. The noise reduction is limited by what the
     sub-filters can form together. Nothing is trained: `band_subfilters` makes them from one broadband control filter,
     which takes a measurement of the primary path with broadband noise.
 
     With a rated power, the gains are reduced to those of the least expected error within it. With R and H, the running
     means of the products of the sub-filters' outputs, before and after the secondary path, these are
 
-    .. math:: (H + \lambda R)\,g' = H g, \qquad \lambda \ge 0, \qquad g'^T R\,g' \le \rho_o
+    .. math:: (H + \lambda R)\,g' = H g, \qquad \lambda \ge 0, \qquad g'^T R\,g' \le \rho_o.
 
-    and the Kalman filter goes on with the gains g.
+    The Kalman filter itself goes on with the gains g.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class SubfilterKalman(BlockProcessing, Checkpointed):
 
     See Also
     --------
-    kf_pb : It adapts all taps within a rated power, and learns the paths.
+    kf_pb : Adapts all taps within a rated power, and learns the paths.
 
     Notes
     -----
@@ -121,8 +121,9 @@ class SubfilterKalman(BlockProcessing, Checkpointed):
     References
     ----------
     The structure is that of Z. Luo, D. Shi, X. Shen, J. Ji, W.-S. Gan, "GFANC-Kalman: Generative fixed-filter active
-    noise control with CNN-Kalman filtering", IEEE Signal Process. Lett. 31, 2024. There, a network measures which of 15
-    sub-filters each second needs, and the Kalman filter smooths its answers. Here, the microphone measures.
+    noise control with CNN-Kalman filtering", IEEE Signal Process. Lett. 31, 2024. There, a network tells from each
+    second of noise which of 15 sub-filters it needs, and the Kalman filter smooths these answers. Here, the Kalman filter
+    observes the error microphone instead.
 
     Examples
     --------

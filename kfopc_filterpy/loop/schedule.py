@@ -17,9 +17,9 @@ NEVER = 2**63 - 1
 
 @dataclass(frozen=True)
 class Schedule:
-    """Values, and the sample at which each begins to replace the one before; `fade` samples later it has done so.
+    """Values, and the samples at which they begin to replace the one before; `fade` samples later they have replaced it.
 
-    Values that are faded are numbers, or arrays of one shape.
+    Values that are cross-faded are numbers, or arrays of one shape.
     """
 
     begins: list[int]
@@ -43,7 +43,7 @@ class Schedule:
             yield value, slice(begin, end), self._risen(i, n) - self._risen(i + 1, n)
 
     def _risen(self, i: int, n: np.ndarray) -> np.ndarray:
-        """Return how far value i, and those after it, have replaced those before it."""
+        """Return the share, 0 to 1, by which value i and those after it have replaced those before it."""
         if i in (0, len(self.begins)):
             return np.full(n.size, float(i == 0))
         if self.fade == 0:
@@ -52,9 +52,10 @@ class Schedule:
 
 
 def steps(value: Any, name: str, *, of_numbers: bool = False) -> list[Any]:
-    """Return pairs (time in s, value) as they are, and a value that stays as the pair of time 0.
+    """Return pairs (time in s, value) as they are, and a value that does not change as a pair with time 0.
 
-    Neither a path nor a list of amplifiers ever pairs a number with something that is none. Levels are numbers.
+    Only such a pair has one number and one thing that is no number: paths and lists of amplifiers have none. Levels are
+    numbers themselves, so for them (`of_numbers`) any two numbers are a pair.
     """
     entries = value if isinstance(value, list | tuple) else ()
     pairs = [isinstance(entry, list | tuple) and len(entry) == 2 for entry in entries]
@@ -78,7 +79,7 @@ def as_schedule(
     *,
     of_numbers: bool = False,
 ) -> Schedule:
-    """Return the schedule of what stays in a run, or of pairs (time in s, value); `read` checks and converts a value."""
+    """Return the schedule of one value, or of pairs (time in s, value); `read` checks and converts a value."""
     pairs = steps(value, name, of_numbers=of_numbers)
     times = [as_number(time, f"a time of {name}", unit="s") for time, _ in pairs]
     begins = [round(min(max(time * fs, -1.0), n_samples)) for time in times]

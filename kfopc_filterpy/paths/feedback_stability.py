@@ -38,13 +38,13 @@ class FeedbackMargin:
     phase_margin_deg : float
         By how many degrees its phase may change.
     frequency_hz : float
-        Frequency of the least margin in Hz.
+        Frequency in Hz at which the disk margin is smallest.
     path_error : float
-        Relative error of the loop's path that the loop stands at every frequency, whatever its phase: with a path times
+        Relative error of the loop's path that the loop tolerates at every frequency, whatever its phase: with a path times
         ``1 + delta`` it is stable as long as ``|delta| < path_error``. It is 1/max|T|, the disk margin of the
-        complementary sensitivity T (skew -1); Inf without any loop, and 0 if it is unstable.
+        complementary sensitivity T (skew -1); Inf if there is no loop, and 0 if the loop is unstable.
     path_error_hz : float
-        Frequency in Hz at which that error is the least.
+        Frequency in Hz at which the tolerated error is smallest.
     loop : control.TransferFunction
         Loop transfer function in python-control's convention: ``1 / (1 + loop)`` is the sensitivity. ``-w (f - f^)`` for
         acoustic feedback.
@@ -69,9 +69,9 @@ class FeedbackMargin:
         )
 
     def path_error_at(self, frequencies_hz: ArrayLike) -> np.ndarray:
-        """Return the relative error of the path that the loop stands at each of `frequencies_hz`, (n_frequencies,).
+        """Return the relative error of the path that the loop tolerates at each of `frequencies_hz`, (n_frequencies,).
 
-        Each value is ``1/|T| = |1 + 1/loop|``, which means something for a loop that is stable.
+        Each value is ``1/|T| = |1 + 1/loop|``, which is meaningful only for a stable loop.
         """
         omega = 2 * np.pi * np.atleast_1d(as_real_array(frequencies_hz, "frequencies_hz"))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -148,7 +148,7 @@ def feedback_margin(
         sampling_rate(feedback_estimate, fs, name="feedback_estimate")
         left = polysub(left, path_taps(feedback_estimate, name="feedback_estimate"))
     if left[0] != 0.0:
-        raise ValueError(f"feedback_path must have a delay of a sample at least: a first tap is {left[0]:g}, not 0")
+        raise ValueError(f"feedback_path must have a delay of at least one sample: a first tap is {left[0]:g}, not 0")
     return _margin(-np.convolve(w, left), np.ones(1), fs)
 
 
@@ -159,10 +159,10 @@ def internal_model_margin(
     *,
     fs: float | None = None,
 ) -> FeedbackMargin:
-    r"""Return whether a feedback controller's loop is stable, and which error of its secondary path it stands.
+    r"""Return whether a feedback controller's loop is stable, and which error of its secondary path it tolerates.
 
-    An internal model subtracts what it expects of the loudspeaker, and the control filter gets the rest a sample late,
-    see `controllers.with_internal_model`. Seen from the error microphone this is a feedback loop
+    An internal model subtracts from the error what it expects the loudspeaker to contribute, and the control filter gets the
+    rest one sample late; see `controllers.with_internal_model`. Seen from the error microphone, this is a feedback loop
 
     .. math:: L = \frac{z^{-1} W S}{1 - z^{-1} W \hat S}, \qquad
        \frac{1}{1 + L} = \frac{1 - z^{-1} W \hat S}{1 + z^{-1} W (S - \hat S)}
@@ -173,18 +173,18 @@ def internal_model_margin(
     Parameters
     ----------
     control_filter : array_like, shape (n_taps,)
-        Settled control filter w: `control_filter` of a feedback controller, or of a hybrid one the last row of it.
+        Settled control filter w: `control_filter` of a feedback controller, or the last row of a hybrid controller's.
     secondary_path : array_like or control.TransferFunction
-        True path s from the loudspeaker to the error microphone, whose errors are asked for.
+        True path s from the loudspeaker to the error microphone.
     secondary_estimate : array_like or control.TransferFunction, optional
-        Estimate of this path, which the controller has; by default the path itself.
+        The controller's estimate of this path; by default the path itself.
     fs : float, optional
         Sampling rate in Hz, needed for tap arrays.
 
     Returns
     -------
     FeedbackMargin
-        Stability and margins; `path_error` is the relative modelling error that the loop stands.
+        Stability and margins; `path_error` is the relative modelling error that the loop tolerates.
 
     Raises
     ------
@@ -193,12 +193,12 @@ def internal_model_margin(
 
     Notes
     -----
-    As for `feedback_margin`, which says the same of acoustic feedback: a hybrid controller may have both loops.
+    The notes of `feedback_margin`, which is for acoustic feedback, hold here too. A hybrid controller may have both loops.
 
     Examples
     --------
-    A path of one sample and a filter that takes half of the disturbance away, then the same with a path that is three
-    times and four times as large as its estimate:
+    A path that delays by one sample and a filter that predicts half of the disturbance, then the same with a path 2.9 and 3.1
+    times as large as its estimate:
 
     >>> from kfopc_filterpy.paths import internal_model_margin
     >>> internal_model_margin([0.5], [0.0, 1.0], fs=8000.0).path_error
@@ -220,7 +220,7 @@ def internal_model_margin(
 
 
 def _margin(numerator: np.ndarray, denominator: np.ndarray, fs: float) -> FeedbackMargin:
-    """Return the margins of the loop ``numerator / denominator``, both in taps, of which the closed loop is an FIR's inverse."""
+    """Return the margins of the loop ``numerator / denominator``, both in taps, whose closed loop is the inverse of an FIR filter."""
     from control import TransferFunction, disk_margins
 
     n = max(numerator.size, denominator.size)

@@ -17,10 +17,10 @@ from .amplifiers import Amplifier, HardClipAmplifier, SoftSaturationAmplifier
 class ExcursionLimitedLoudspeaker:
     r"""Loudspeaker whose cone moves no further than its data sheet allows, as a Wiener-Hammerstein model.
 
-    A low-pass of second order makes the excursion out of the control signal, a memoryless function limits it, and the
-    inverse of the low-pass makes a control signal out of the result: the one that moves a cone without limit in this
-    way. Its sound is that of the limited cone, so the secondary path stays that of soft signals. A signal whose
-    excursion is within the limit passes as it is.
+    A second-order low-pass gives the excursion for the control signal, and a memoryless function limits it. The inverse of
+    the low-pass then gives the control signal that would move a cone without a limit in the same way. It makes the same
+    sound as the limited cone, so the secondary path remains the one measured with quiet signals. A signal whose excursion
+    is within the limit passes unchanged.
 
     Use it as `amplifier` of `simulate`, of `paths.identify_secondary_path` or of `realtime.SimulatedInterface`. Each run
     and each loudspeaker works with a copy `at_rest`.
@@ -28,7 +28,8 @@ class ExcursionLimitedLoudspeaker:
     The low-pass :math:`1 / (1 + s/(Q_{ts} \omega_s) + s^2/\omega_s^2)` is sampled with its exact poles and the exact
     gain at 0 Hz, but without zeros, so that its inverse has a finite impulse response. (The zeros of the bilinear
     transform would be poles at fs/2 of the inverse.) The gain is right within 0.12 dB up to fs/16 and 0.45 dB up to
-    fs/8; the excursion comes a sample early, which the inverse makes up for. Above the resonance the excursion falls by 12 dB per octave.
+    fs/8; the excursion comes one sample early, which the inverse makes up for. Above the resonance, the
+    excursion falls by 12 dB per octave.
 
     Not modelled: the variation of force factor and inductance with the excursion, heating, and different limits
     inwards and outwards.
@@ -50,7 +51,7 @@ class ExcursionLimitedLoudspeaker:
         Volts at the loudspeaker for a control signal of 1.
     sharpness : float, optional
         Exponent p of a limit that is approached smoothly, see `SoftSaturationAmplifier`. By default the excursion is
-        clipped: the sound then has clicks, as of a cone that hits a stop.
+        clipped: the sound then has clicks, like those of a cone that hits a stop.
 
     Raises
     ------
@@ -63,7 +64,7 @@ class ExcursionLimitedLoudspeaker:
 
     Examples
     --------
-    Five volts at 20 Hz move this cone as far as it goes, twenty at 400 Hz by much less:
+    Five volts at 20 Hz move this cone as far as it goes, twenty volts at 400 Hz much less:
 
     >>> import numpy as np
     >>> from kfopc_filterpy.power import ExcursionLimitedLoudspeaker
@@ -105,13 +106,13 @@ class ExcursionLimitedLoudspeaker:
         return replace(self)
 
     def excursion_mm(self, control_signal: ArrayLike) -> np.ndarray:
-        """Return the excursion of the cone in mm, (n_samples,), for a `control_signal`, (n_samples,), from rest on."""
+        """Return the excursion of the cone in mm, (n_samples,), for a `control_signal`, (n_samples,), that starts at rest."""
         y = as_signal(control_signal, "control_signal")
         excursion: np.ndarray = self._limit(lfilter(self._gain, self._recursion, y))
         return excursion
 
     def __call__(self, signal: ArrayLike) -> Any:
-        """Return what the next sample, or the next ones, (n_samples,), of the control signal become."""
+        """Return what becomes of the next sample, or of the next samples, (n_samples,), of the control signal."""
         y = np.atleast_1d(np.asarray(signal, dtype=np.float64))
         free, self._moving = lfilter(self._gain, self._recursion, y, zi=self._moving)
         # What the limit takes away passes the inverse alone: a signal within the limit stays the same to the bit.
