@@ -162,8 +162,8 @@ def assess(
     If a loudspeaker's rating has an excursion, the rated power is the largest at which the best fixed filter's control
     signal keeps it.
 
-    With `feedback`, the ceilings are those of predictors: filters of the disturbance a sample late. One channel's settled
-    loop is judged by `paths.internal_model_margin`, with the least margin of `secondary` and of the paths that
+    With `feedback`, the ceilings are those of predictors: filters of the disturbance one sample late. With one channel,
+    the settled loop is judged by `paths.internal_model_margin`, with the least margin of `secondary` and of the paths that
     `secondary_path_uncertainty` may hold.
 
     With several loudspeakers the required rated powers are in the proportions of the ratings. The coherence is the multiple
@@ -421,19 +421,19 @@ def _settled_loop(run: SimulationResult, s: np.ndarray, uncertainty: Any) -> Fee
 
 
 def _on_uncertain_path(loop: FeedbackMargin | None, s: np.ndarray, uncertainty: Any) -> list[str]:
-    """Return where the path may be more wrong than the settled loop surely stands; measured paths were tried."""
+    """Return a note if the path may be more wrong than the settled loop surely tolerates; measured paths were tried."""
     stated: Any = as_uncertainty(uncertainty)
     if loop is None or np.ndim(stated) > 1:
         return []
     error = path_uncertainty(uncertainty, s)
     frequencies = np.linspace(0.0, 1.0 / (2.0 * loop.loop.dt), error.size)
-    stood = loop.path_error_at(frequencies)
-    worst = int(np.argmax(error / stood))
-    if error[worst] < stood[worst]:
+    tolerated = loop.path_error_at(frequencies)
+    worst = int(np.argmax(error / tolerated))
+    if error[worst] < tolerated[worst]:
         return []
     return [
         f"The secondary path may be wrong by {error[worst]:.0%} at {frequencies[worst]:.0f} Hz, where the settled loop "
-        f"stands {stood[worst]:.0%}: measure it again as it is in use, and state both measurements."
+        f"tolerates {tolerated[worst]:.0%}: measure the path again as it is in use, and state both measurements."
     ]
 
 
@@ -495,7 +495,7 @@ def _on_louder_bands(run: SimulationResult) -> list[str]:
     if not count:
         return []
     return [
-        f"{run.algorithm} makes {count} of {more.size} third octaves louder, most the one at {centres[most]:.0f} Hz: "
+        f"{run.algorithm} makes {count} of {more.size} third octaves louder, most of all the one at {centres[most]:.0f} Hz: "
         f"by {more[most]:.1f} dB."
     ]
 

@@ -248,12 +248,12 @@ class Assessment:
 
     @property
     def stability(self) -> str:
-        """Which error of its path a settled feedback loop stands, as one sentence; empty without such a loop."""
+        """Error of its path that a settled feedback loop tolerates, as one sentence; empty without such a loop."""
         if self.loop is None:
             return ""
         loop = self.loop
         return (
-            f"The settled loop stands a secondary path that is wrong by {loop.path_error:.0%} (the least, at "
+            f"The settled loop tolerates a secondary path that is wrong by {loop.path_error:.0%} (least at "
             f"{loop.path_error_hz:.0f} Hz); its gain may change by {loop.gain_margin_db:.1f} dB or its phase by "
             f"{loop.phase_margin_deg:.0f} degrees."
         )

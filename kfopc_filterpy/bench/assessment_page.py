@@ -277,7 +277,7 @@ def _checks(verdict: Assessment) -> dict[str, str]:
     peak = "no peak limit" if limits.amplitude_limit is None else _peak_limits(verdict)
     causality, least = "unknown without a primary path", f"Least power for {verdict.want_db:g} dB"
     if verdict.feedback:
-        causality = "the error microphone hears each control signal by the delay of the secondary path later"
+        causality = "the error microphone hears each control signal only after the delay of the secondary path"
     elif late is not None:
         causality = f"the anti-noise is {abs(1e3 * late):.2g} ms {'early' if late >= 0 else 'late'}"
     checks = {

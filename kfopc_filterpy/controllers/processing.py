@@ -128,7 +128,7 @@ def process_steps(
 
 
 def takes_none(controller: object, references: object) -> bool:
-    """Return whether a controller takes no references; raise ValueError if it does and has some, or needs them."""
+    """Return whether a controller takes no references; raise ValueError if it gets some, or needs them and gets none."""
     none = getattr(controller, "n_references", 1) == 0
     given: Any = references
     if none and references is not None and np.size(given):

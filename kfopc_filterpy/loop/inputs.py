@@ -95,7 +95,7 @@ def _through(
     fs: float,
     crossfade_s: float,
 ) -> np.ndarray:
-    """Return what comes through paths that may change; what is on its way then arrives by the new ones."""
+    """Return what comes through paths that may change; sound on its way at a change arrives through the new path."""
     n_samples = x.shape[-1]
     paths = path_schedule(primary_path, "primary_path", read, n_samples, fs, crossfade_s)
     d = np.zeros((*paths.values[0].shape[:-2], n_samples))

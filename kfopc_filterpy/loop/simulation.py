@@ -73,8 +73,8 @@ def simulate(
 
     Paths, amplifiers and the level of the noise may change during the run. Give pairs (time in s, value) in place of a
     value, such as ``secondary_path=[(0.0, closed), (3.5, opened)]``. The times count from the start of `reference`,
-    begin with 0 and rise; the value holds from the sample ``round(time * fs)`` on. The delay lines go on: what is on
-    its way when a path changes arrives by the new one.
+    begin with 0 and rise; the value holds from the sample ``round(time * fs)`` on. The delay lines go on: sound that
+    is on its way when a path changes arrives through the new one.
 
     Parameters
     ----------
@@ -112,11 +112,10 @@ def simulate(
         Acoustic feedback from the amplifier to the reference microphone, (I, J, n_taps) with several; its first tap must
         be 0. By default none.
     noise_level_db : float, default 0
-        Gain of `reference` in dB, and with `primary_path` so of the disturbance; not together with `disturbance`.
+        Gain in dB of `reference`, and so of the disturbance that `primary_path` makes; not together with `disturbance`.
     crossfade_s : float, default 0
-        Time in s from the beginning to the end of a change of the paths or the level, at most the shortest time between
-        two of them. Meanwhile the taps, or the gains, are interpolated linearly between the old and the new, for each
-        sample. 0 switches at once; amplifiers are always switched.
+        Duration in s of a change of the paths or the level, at most the shortest time between two changes. Meanwhile the
+        taps, or the gains, are interpolated linearly between the old and the new, for each sample. 0 switches at once; amplifiers are always switched.
     record_weights_every : int, optional
         Record the control filter (a controller's `control_filter`, or else its `weights`) every so many samples.
     record_powers : bool, default False
@@ -387,7 +386,7 @@ def _read_signals(
     x = signal[:0] if reference is None else signal
     if disturbance is not None and noise_level_db != 0.0:
         raise ValueError(
-            "noise_level_db needs primary_path=, by which the disturbance follows; if you give the disturbance, scale "
+            "noise_level_db needs primary_path=, so that the disturbance follows; if you give the disturbance, scale "
             "both signals yourself, with signals.level_jump for example"
         )
     if noise_level_db != 0.0:

@@ -267,7 +267,7 @@ def test_without_a_reference_microphone_the_noise_is_that_of_the_ear(command, fo
     jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
     assert 0 < data["loop"]["path_error"] < 10
     page = (tmp_path / "out" / "verdict.html").read_text("utf-8")
-    assert "settled loop stands a secondary path that is wrong by" in page
+    assert "settled loop tolerates a secondary path that is wrong by" in page
     assert data["ceilings"]["coherence_db"] is None
     d, s = (read_recording(folder / f"{name}.wav").one_channel() for name in ("d", "S"))
     half = d[d.size // 2 :] - d.mean()
