@@ -189,7 +189,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         return y
 
     def emitted(self, control_signal: float) -> None:
-        """Take what a limiter made of the last control signal; `LimitedController` calls this."""
+        """Take `control_signal`, to which a limiter changed the last one; `LimitedController` calls this."""
         self._played[:, self._n - 1] = control_signal
 
     def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
