@@ -91,11 +91,12 @@ class CommandController(BlockController):
             raise EntryFailed(f"cannot be started: {error}") from None
         self._timer = Timer(timeout_s, self._give_up)
         self._timer.start()
-        self._write(json.dumps(header).encode() + b"\n")
+        self._unsent = json.dumps(header).encode() + b"\n"  # goes before the first block, where a failure ends the command
 
     def exchange(self, references: np.ndarray, errors: np.ndarray) -> np.ndarray:
         """Return the command's answer to a block."""
-        self._write(np.concatenate((references, errors)).astype(FLOAT).tobytes())
+        self._write(self._unsent + np.concatenate((references, errors)).astype(FLOAT).tobytes())
+        self._unsent = b""
         asked = FLOAT.itemsize * self._playing.size
         answer = self._stdout.read(asked)
         if len(answer) < asked:

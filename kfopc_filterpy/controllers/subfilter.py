@@ -156,7 +156,7 @@ class SubfilterKalman(BlockProcessing, Checkpointed):
     ) -> None:
         self.fs = as_positive(fs, "fs", unit="Hz")
         memory = as_positive(memory_s, "memory_s", unit="s") * self.fs
-        bank = as_real_array(subfilters, "subfilters")
+        bank = as_real_array(subfilters, "subfilters").copy()
         if bank.ndim != 2 or bank.size == 0:
             raise ValueError(f"subfilters must be (C, L), one row for each sub-filter, got shape {bank.shape}")
         require_finite(bank, "subfilters")

@@ -136,8 +136,8 @@ def simulate(
     ValueError
         Signals that are empty, not finite or of different lengths; sample rates that differ; both or neither of
         `primary_path` and `disturbance`; a feedback path without delay; times that do not begin with 0, do not rise or
-        are beyond the run. Nothing was changed. During a run: an amplifier
-        that returns NaN, or an update without a solution (a covariance that is too large).
+        are beyond the run. Nothing was changed. During a run: an amplifier that returns NaN, or an update without a
+        solution (a covariance that is too large).
     TypeError
         A controller without `control_signal` and `update`, or an amplifier that is not a function.
 
@@ -177,13 +177,13 @@ def simulate(
     if rated is not None:
         rated = per_loudspeaker(rated, J, "rated_power") if several else as_positive(rated, "rated_power")
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
-    on = switch_on_sample(switch_on_s, fs, x.shape[1])
     n_samples = x.shape[1]
+    on = switch_on_sample(switch_on_s, fs, n_samples)
     amplifiers = as_schedule(amplifier, "amplifier", lambda one: _amplifiers(one, J), n_samples, fs)
     feedback = _feedback(feedback_path, fs, len(x), J, several, n_samples, crossfade_s)
     if hasattr(controller, "require_sample_rate"):
         controller.require_sample_rate(fs)
-    weights = _weight_rows(x.shape[1] - on, controller, every, several)
+    weights = _weight_rows(n_samples - on, controller, every, several)
     if on:
         heard = x[:, :on].copy(), d[:, :on] + noise.take(K, on)
         signals_heard = heard if several else (signal[0] if len(signal) else None for signal in heard)
@@ -384,7 +384,7 @@ def _read_signals(
     heard = ("disturbance", disturbance) if reference is None else ("reference", reference)
     signal = np.atleast_2d((as_channels if several else as_signal)(heard[1], heard[0]))
     x = signal[:0] if reference is None else signal
-    if disturbance is not None and noise_level_db != 0.0:
+    if disturbance is not None and not np.array_equal(noise_level_db, 0.0):
         raise ValueError(
             "noise_level_db needs primary_path=, so that the disturbance follows; if you give the disturbance, scale "
             "both signals yourself, with signals.level_jump for example"

@@ -41,7 +41,9 @@ def test_the_bands_sum_to_the_filter_and_do_not_overlap(taps: int, n_bands: int)
 def test_the_gains_are_those_of_batch_least_squares() -> None:
     """Without state noise, a Kalman filter is regularised least squares: (sum h h' / q + I / P0) g = sum h d / q."""
     bank, x, q = band_subfilters(broadband(), 5), white(600, 1), 1e-2
-    controller = SubfilterKalman(bank, SECONDARY, state_noise=0.0, measurement_noise=q, initial_variance=2.0, fs=FS)
+    given = bank.copy()
+    controller = SubfilterKalman(given, SECONDARY, state_noise=0.0, measurement_noise=q, initial_variance=2.0, fs=FS)
+    given[:] = 0.0  # the controller has its own
     result = run(controller, x)
     rows = np.array([np.convolve(np.convolve(w, SECONDARY), x)[: x.size] for w in bank])
     expected = np.linalg.solve(rows @ rows.T / q + np.eye(5) / 2.0, rows @ result.disturbance / q)
@@ -90,7 +92,7 @@ def test_an_ample_rated_power_changes_nothing() -> None:
 )
 def test_bad_settings_are_refused(change: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        SubfilterKalman(**{"subfilters": np.ones((2, 4)), "secondary_path": SECONDARY, **NOISES} | change)
+        SubfilterKalman(**{"subfilters": np.ones((2, 4)), "secondary_path": SECONDARY} | NOISES | change)
 
 
 def test_bad_calls_are_refused_and_change_nothing() -> None:

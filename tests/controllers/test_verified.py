@@ -63,21 +63,12 @@ def noises_of_two(seconds: float) -> tuple[np.ndarray, np.ndarray]:
 
 def run(controller: Any, x: np.ndarray, d: np.ndarray, path: Any, later: Any = None, at: int = 0) -> np.ndarray:
     """Return errors and control signals, (K + J, n), in a room whose path is another one from a sample on."""
-    several = np.ndim(x) == 2
-    rows = [np.atleast_2d(signal) for signal in (x, d)]
-    paths = [
-        np.asarray(one if several else np.reshape(one, (1, 1, -1))) for one in (path, path if later is None else later)
-    ]
-    taps = max(one.shape[2] for one in paths)
-    paths = [np.pad(one, ((0, 0), (0, 0), (0, taps - one.shape[2]))) for one in paths]
-    played, kept = np.zeros(paths[0].shape[1:]), []
-    for n in range(rows[0].shape[1]):
-        y = controller.control_signal(rows[0][:, n] if several else rows[0][0, n])
-        played[:, 1:], played[:, 0] = played[:, :-1].copy(), y
-        e = rows[1][:, n] - np.tensordot(paths[n >= at], played)
-        controller.update(e if several else e[0])
-        kept.append(np.append(e, y))
-    return np.transpose(kept)
+    paths = [(0.0, later)] if at == 0 and later is not None else [(0.0, path)]
+    if at:
+        paths.append((at / FS, later))
+    # The run must not end when the control signal is far too loud: what follows is tested.
+    result = simulate(controller, x, disturbance=d, secondary_path=paths, fs=FS, rated_power=1e200)
+    return np.concatenate((np.atleast_2d(result.error), np.atleast_2d(result.control_signal)))
 
 
 def changes_db(error: np.ndarray, d: np.ndarray, seconds: float = 1.0) -> np.ndarray:
@@ -332,7 +323,8 @@ def test_what_was_assigned_survives_a_new_start() -> None:
     """Also that of the copy with which it starts: it fails twice."""
     x, d = noises(4.0)
     limiter = OutputLimiter(0.05, fs=FS, window_s=1.0)
-    controller = verified(kf_opc(L, S, rated_power=4.0, state_noise=1e-8, measurement_noise=0.01, initial_variance=0.1))
+    own = kf_opc(L, S, rated_power=4.0, state_noise=1e-8, measurement_noise=0.01, initial_variance=0.1, fs=FS)
+    controller = verified(own)
     first = controller.controller
     controller.limiter, controller.rated_power = limiter, 2.0
     controller.secondary_path, controller.secondary_path_uncertainty = -0.9 * S, PathTolerance(gain_db=1.0)

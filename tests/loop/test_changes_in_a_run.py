@@ -61,9 +61,8 @@ class Gain:
         pass
 
 
-@pytest.mark.parametrize(
-    "on", [0, 60]
-)  # the first sample with control: the times count from the start of the reference
+# `on` is the first sample with control: the times count from the start of the reference.
+@pytest.mark.parametrize("on", [0, 60])
 @pytest.mark.parametrize("fade", [0, 20, 130])  # the last is all the time between two changes of the feedback
 def test_everything_changes_as_in_plain_numpy(fade: int, on: int) -> None:
     run = simulate(Gain(), X, crossfade_s=fade / FS, switch_on_s=on / FS, **ALL)
@@ -181,6 +180,7 @@ REFUSED = [
     ({"noise_level_db": [(0.0, 0.0), (0.1, np.inf)]}, "noise_level_db must be finite"),
     ({"noise_level_db": 1e300}, "noise_level_db must be within 400 dB of 0 dB"),
     ({"noise_level_db": 6.0, "primary_path": None, "disturbance": D}, "noise_level_db needs primary_path="),
+    ({"noise_level_db": np.eye(2), "primary_path": None, "disturbance": D}, "noise_level_db needs primary_path="),
 ]
 
 
