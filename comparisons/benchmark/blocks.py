@@ -91,7 +91,8 @@ class CommandController(BlockController):
             raise EntryFailed(f"cannot be started: {error}") from None
         self._timer = Timer(timeout_s, self._give_up)
         self._timer.start()
-        self._unsent = json.dumps(header).encode() + b"\n"  # goes before the first block, where a failure ends the command
+        # Written before the first block: a failure there ends the command and its timer.
+        self._unsent = json.dumps(header).encode() + b"\n"
 
     def exchange(self, references: np.ndarray, errors: np.ndarray) -> np.ndarray:
         """Return the command's answer to a block."""

@@ -144,8 +144,8 @@ def assess(
     TypeError, ValueError
         Signals that are not finite, silent, too short for the filter or for a run of 2 s, or of different lengths; paths
         whose channels do not fit the signals; neither a primary path nor a disturbance, or one of them with `feedback`; a
-        settled feedback loop without a margin, with the secondary path or one that was measured again; a rating that does not limit the
-        mean power, or ratings for another number of loudspeakers; an unknown algorithm.
+        settled feedback loop without a margin, with the secondary path or one that was measured again; a rating that does
+        not limit the mean power, or ratings for another number of loudspeakers; an unknown algorithm.
 
     Notes
     -----

@@ -57,15 +57,22 @@ def steps(value: Any, name: str, *, of_numbers: bool = False) -> list[Any]:
     Only such a pair has one number and one thing that is no number: paths and lists of amplifiers have none. Levels are
     numbers themselves, so for them (`of_numbers`) any two numbers are a pair.
     """
-    entries = value if isinstance(value, list | tuple) else ()
-    pairs = [isinstance(entry, list | tuple) and len(entry) == 2 for entry in entries]
-    if not any(
-        pair and (of_numbers or isinstance(entry[0], Real) != isinstance(entry[1], Real))
-        for pair, entry in zip(pairs, entries, strict=True)
-    ):
+
+    def is_pair(entry: Any) -> bool:
+        return (
+            isinstance(entry, list | tuple)
+            and len(entry) == 2
+            and (of_numbers or isinstance(entry[0], Real) != isinstance(entry[1], Real))
+        )
+
+    pairs = [is_pair(entry) for entry in value] if isinstance(value, list | tuple) else []
+    if not any(pairs) and not is_pair(value):
         return [(0.0, value)]
     if not all(pairs):
-        raise ValueError(f"{name} must be one value, or a list of pairs (time in s, value), but not a mixture of both")
+        raise ValueError(
+            f"{name} must be one value, or a list of pairs (time in s, value): not a mixture of both, nor a pair without "
+            "a list around it"
+        )
     return list(value)
 
 

@@ -168,6 +168,8 @@ REFUSED = [
     ({"secondary_path": [(np.nan, S), (0.1, S)]}, "a time of secondary_path must be finite"),
     ({"secondary_path": [(S, 0.0), (S, 0.1)]}, "a time of secondary_path must be a single number in s"),
     ({"secondary_path": [(0.0, S), S]}, r"secondary_path must be one value, or a list of pairs \(time in s, value\)"),
+    ({"secondary_path": (0.1, S)}, "secondary_path must be one value, .* nor a pair without a list around it"),
+    ({"noise_level_db": (0.0, 6.0)}, "noise_level_db must be one value, .* nor a pair without a list around it"),
     ({"secondary_path": [(0.0, S), (0.1, [np.nan])]}, "secondary_path must be finite"),
     ({"secondary_path": [(0.0, [[S]]), (0.1, [[S], [S]])]}, r"same numbers of channels .* \(1, 1, 3\) and \(2, 1, 3\)"),
     ({"primary_path": [(0.0, S), (0.5, S)]}, "primary_path must have times that rise, .* within the run"),
