@@ -93,11 +93,13 @@ class OutputPowerConstraint:
 
     def fresh(self, rated_power: float | None = None) -> OutputPowerConstraint:
         """Return a constraint with the same settings and no samples yet; `rated_power` replaces the rated power."""
-        rated, own = (
+        return OutputPowerConstraint(
             self.rated_power if rated_power is None else rated_power,
-            {"fs": self.fs, "memory_s": self.memory_s},
+            secondary_path_gain=self._given_gain,
+            fs=self.fs,
+            memory_s=self.memory_s,
+            window=self.window,
         )
-        return OutputPowerConstraint(rated, secondary_path_gain=self._given_gain, window=self.window, **own)
 
     @property
     def state(self) -> ConstraintState:

@@ -164,9 +164,12 @@ class Supervisor(Checkpointed):
         self.on_divergence = as_choice(on_divergence, "on_divergence", ACTIONS)
         self.largest_gain = as_positive(largest_gain, "largest_gain")
         self.recovery_samples = _remembered(controller)
-        limits: dict[str, Any] = {"most_equal": as_sample_count(stuck_s, fs, "stuck_s"), "rate": 1.0 / (0.1 * self.fs)}
-        limits["full_scale"] = np.inf if full_scale is None else as_positive(full_scale, "full_scale")
-        self._inspectors = [Inspector(n, **limits) for n in (self.n_references, self.n_microphones)]
+        most_equal, rate = as_sample_count(stuck_s, fs, "stuck_s"), 1.0 / (0.1 * self.fs)
+        loudest = np.inf if full_scale is None else as_positive(full_scale, "full_scale")
+        self._inspectors = [
+            Inspector(n, most_equal=most_equal, rate=rate, full_scale=loudest)
+            for n in (self.n_references, self.n_microphones)
+        ]
         self.health = Health()
         self._fresh = deepcopy(controller)
         self._good = self._fresh if on_divergence == "freeze" else None  # state of the last good window
@@ -296,15 +299,17 @@ class Supervisor(Checkpointed):
         """Return copies of references (I, n) and errors (K, n); what is missing is NaN."""
         if references is None and errors is None:
             raise ValueError("references or errors must be given: without both, the length of the block is not known")
-        given = {"references": (references, self.n_references), "errors": (errors, self.n_microphones)}
-        read = {name: _channels(block, n, name) for name, (block, n) in given.items() if block is not None}
-        lengths = {block.shape[1] for block in read.values()}
+        x = None if references is None else _channels(references, self.n_references, "references")
+        e = None if errors is None else _channels(errors, self.n_microphones, "errors")
+        lengths = {block.shape[1] for block in (x, e) if block is not None}
         if len(lengths) != 1 or 0 in lengths:
             found = " and ".join(map(str, sorted(lengths)))
             raise ValueError(f"references and errors must have the same number of samples, at least 1, got {found}")
-        length = lengths.pop()
-        x, e = (read.get(name, np.full((n, length), np.nan)) for name, (_, n) in given.items())
-        return x, e
+        n = lengths.pop()
+        return (
+            np.full((self.n_references, n), np.nan) if x is None else x,
+            np.full((self.n_microphones, n), np.nan) if e is None else e,
+        )
 
     def _usable(self, x: np.ndarray, e: np.ndarray) -> np.ndarray:
         """Return which samples can be learned from, (n,); bad ones are replaced in place and noted."""
@@ -395,8 +400,8 @@ class Supervisor(Checkpointed):
             while begin < n:
                 room = np.zeros((self.n_loudspeakers, n - begin))
                 try:
-                    signals = (self._shaped(signal[:, begin:]) for signal in (x, e))
-                    process(*signals, adapt=adapt[begin:], out=self._shaped(room))
+                    x_left, e_left = self._shaped(x[:, begin:]), self._shaped(e[:, begin:])
+                    process(x_left, e_left, adapt=adapt[begin:], out=self._shaped(room))
                     done = n - begin
                 except RefusedUpdate as refused:
                     done = refused.sample + 1
