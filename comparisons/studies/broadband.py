@@ -117,8 +117,9 @@ def main(runs: Runs) -> StudyReport:
 def _scene(n_taps: int) -> Scene:
     noises = {seed: band_limited_noise(BAND, DURATION_S, fs=FS, rng=seed) for seed in SEEDS}
     paths = (bandpass_path(n, fs=FS) for n in (128, 32))
-    powers: dict[str, Any] = {"rated_power": RATED_POWER, "power_multiple": POWER_MULTIPLE}
-    return bench.make_scene(noises, *paths, fs=FS, n_taps=n_taps, **powers)
+    return bench.make_scene(
+        noises, *paths, fs=FS, rated_power=RATED_POWER, power_multiple=POWER_MULTIPLE, n_taps=n_taps
+    )
 
 
 # ---- Runs

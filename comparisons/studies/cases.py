@@ -139,8 +139,17 @@ def make_case(
     That power is of the filter with which a Kalman filter without state noise would end, ``(R_x' + q/(N P0) I) w = r``
     over the record. Without the ridge, directions that the noise hardly excites could ask for any power.
     """
-    own: dict[str, Any] = {"n_taps": n_taps, "sensor_noise_db": sensor_noise_db, "switch_on_s": SWITCH_ON_S}
-    scene = make_scene({seed: noise}, *pair, fs=FS, rated_power=1.0, power_multiple=1.0, nse_window_s=0.05, **own)
+    scene = make_scene(
+        {seed: noise},
+        *pair,
+        fs=FS,
+        rated_power=1.0,
+        power_multiple=1.0,
+        n_taps=n_taps,
+        switch_on_s=SWITCH_ON_S,
+        sensor_noise_db=sensor_noise_db,
+        nse_window_s=0.05,
+    )
     normal = louder(scene, 1.0 / np.sqrt(bound_of(scene).unconstrained.control_power))
     return replace(normal, unconstrained_power=1.0)
 
@@ -171,8 +180,9 @@ def bound_of(scene: Scene, segment_s: float = 1.0) -> PowerConstrainedWiener:
     ridge = scene.measurement_noise / (scene.settled[0].shape[-1] * scene.initial_variance)
     with reachable_weights():
         plant = scene.references[0], scene.disturbances[0], scene.secondary, scene.n_taps, scene.rated_power
-        times: dict[str, Any] = {"fs": scene.fs, "segment_s": segment_s, "switch_on_s": scene.switch_on_s}
-        return power_constrained_wiener(*plant, **times, ridge=ridge)
+        return power_constrained_wiener(
+            *plant, fs=scene.fs, segment_s=segment_s, switch_on_s=scene.switch_on_s, ridge=ridge
+        )
 
 
 def bounds_db(scene: Scene, stationary: bool) -> tuple[float, float]:

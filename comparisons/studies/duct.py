@@ -97,8 +97,15 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
 def _study(
     runs: Runs, name: str, title: str, noise: np.ndarray, paths: tuple[Any, ...], parameters: dict[str, Parameter]
 ) -> StudyReport:
-    own: dict[str, Any] = {"rated_power": RATED_POWER, "power_multiple": POWER_MULTIPLE, "nse_window_s": NSE_WINDOW_S}
-    scene = bench.make_scene({SEED: noise}, *paths, fs=FS, n_taps=N_TAPS, **own)
+    scene = bench.make_scene(
+        {SEED: noise},
+        *paths,
+        fs=FS,
+        rated_power=RATED_POWER,
+        power_multiple=POWER_MULTIPLE,
+        n_taps=N_TAPS,
+        nse_window_s=NSE_WINDOW_S,
+    )
     tuned = bench.tune(runs, scene, ALGORITHMS)
     smaller = replace(scene, rated_power=scene.unconstrained_power / OTHER_MULTIPLE)
 

@@ -116,9 +116,18 @@ def _noises(fs: float, band_hz: tuple[float, float]) -> dict[str, Callable[[floa
 def make_rated_scene(place: Place, noise: str, duration_s: float) -> Scene:
     """Return the scene of a noise; each loudspeaker is rated at a quarter of the power that it would use unlimited."""
     x = place.noises[noise](duration_s + SWITCH_ON_S)
-    own: dict[str, Any] = {"n_taps": place.n_taps, "sensor_noise_db": SENSOR_NOISE_DB, "switch_on_s": SWITCH_ON_S}
-    own |= {"fs": place.fs, "rated_power": 1.0, "power_multiple": 1.0, "nse_window_s": 0.05}
-    scene = make_scene({SEED: x[np.newaxis]}, place.primary, place.secondary, **own)
+    scene = make_scene(
+        {SEED: x[np.newaxis]},
+        place.primary,
+        place.secondary,
+        fs=place.fs,
+        rated_power=1.0,
+        power_multiple=1.0,
+        n_taps=place.n_taps,
+        switch_on_s=SWITCH_ON_S,
+        sensor_noise_db=SENSOR_NOISE_DB,
+        nse_window_s=0.05,
+    )
     free = replace(scene, rated_power=1e12)
     wanted = bound_of(free, segment_s=2 * duration_s).unconstrained.control_power
     return replace(scene, rated_power=RATED_SHARE * wanted, unconstrained_power=wanted)

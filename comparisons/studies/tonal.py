@@ -104,8 +104,16 @@ def main(runs: Runs) -> StudyReport:
 
 
 def _scene(primary: Any, secondary: Any) -> Scene:
-    noises, own = {0: tone(TONE_HZ, DURATION_S, fs=FS)}, {"rated_power": RATED_POWER, "power_multiple": POWER_MULTIPLE}
-    return bench.make_scene(noises, primary, secondary, fs=FS, n_taps=N_TAPS, amplifier=HardClipAmplifier(LIMIT), **own)
+    return bench.make_scene(
+        {0: tone(TONE_HZ, DURATION_S, fs=FS)},
+        primary,
+        secondary,
+        fs=FS,
+        rated_power=RATED_POWER,
+        power_multiple=POWER_MULTIPLE,
+        n_taps=N_TAPS,
+        amplifier=HardClipAmplifier(LIMIT),
+    )
 
 
 def _figures(result: SimulationResult, scene: Scene) -> dict[str, float | None]:

@@ -125,8 +125,9 @@ def known_paths(pair: Pair) -> dict[str, Knowledge]:
     """Return the estimates of the secondary path, by what is wrong with them."""
     secondary = pair[1]
     std = float(np.sqrt(np.sum(secondary**2)) * 10 ** (SENSOR_NOISE_DB / 20))
-    own: dict[str, Any] = {"n_taps": secondary.size, "duration_s": IDENTIFICATION_S, "rng": SEED}
-    found = identify_secondary_path(secondary, fs=FS, sensor_noise_std=std, **own)
+    found = identify_secondary_path(
+        secondary, fs=FS, n_taps=secondary.size, duration_s=IDENTIFICATION_S, sensor_noise_std=std, rng=SEED
+    )
     wrong = {error: path_taps(perturbed_path(secondary, fs=FS, **own)) for error, own in ERRORS.items()}
     return {
         EXACT: (secondary, None),

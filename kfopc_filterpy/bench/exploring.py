@@ -409,8 +409,16 @@ def _normalised_scene(setup: AcousticSetup, band: tuple[float, float]) -> Scene:
 
     It is what takes long of a run, and level and rating only scale it.
     """
-    own: dict[str, Any] = {"rated_power": 1.0, "power_multiple": 1.0, "n_taps": N_TAPS, "switch_on_s": SWITCH_ON_S}
-    return make_scene({0: _noise(setup, band)}, setup.primary, setup.secondary, fs=setup.fs, **own)
+    return make_scene(
+        {0: _noise(setup, band)},
+        setup.primary,
+        setup.secondary,
+        fs=setup.fs,
+        rated_power=1.0,
+        power_multiple=1.0,
+        n_taps=N_TAPS,
+        switch_on_s=SWITCH_ON_S,
+    )
 
 
 def _noise(setup: AcousticSetup, band: tuple[float, float]) -> np.ndarray:

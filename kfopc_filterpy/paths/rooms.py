@@ -93,10 +93,16 @@ class RoomPaths:
             As for `room_paths`.
         """
         positions = as_real_array(microphones_m, "microphones_m")
-        room: dict[str, Any] = {"absorption": self.absorption, "fs": self.fs, "speed_of_sound": self.speed_of_sound}
-        places: dict[str, Any] = {"loudspeakers_m": self.loudspeakers_m, "sources_m": self.sources_m}
-        places["microphones_m"] = positions.reshape(-1, 3) if positions.shape[-1:] == (3,) else positions
-        return room_paths(self.size_m, **places, **room, n_taps=self.primary.shape[2])
+        return room_paths(
+            self.size_m,
+            loudspeakers_m=self.loudspeakers_m,
+            sources_m=self.sources_m,
+            microphones_m=positions.reshape(-1, 3) if positions.shape[-1:] == (3,) else positions,
+            absorption=self.absorption,
+            fs=self.fs,
+            n_taps=self.primary.shape[2],
+            speed_of_sound=self.speed_of_sound,
+        )
 
 
 def room_paths(

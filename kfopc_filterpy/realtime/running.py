@@ -578,9 +578,15 @@ class _Watch:
     def _figures(self, e: np.ndarray, y: np.ndarray) -> dict[str, Any]:
         """Return what both reports state, of the powers of errors and control signals."""
         rated = getattr(self._supervisor.controller, "rated_power", None)
-        counts = {name: getattr(self._session, name) for name in ("overruns", "lost", "underflows")}
-        shown = {"reduction_db": _db(self._before, e), "powers": y, "health": self._supervisor.health}
-        return {**counts, **shown, "rated_power": None if rated is None else np.atleast_1d(rated)}
+        return {
+            "reduction_db": _db(self._before, e),
+            "powers": y,
+            "rated_power": None if rated is None else np.atleast_1d(rated),
+            "overruns": self._session.overruns,
+            "lost": self._session.lost,
+            "underflows": self._session.underflows,
+            "health": self._supervisor.health,
+        }
 
     def _status(self) -> RunStatus:
         x, e, y = self._powers(self._new)
