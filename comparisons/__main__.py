@@ -50,9 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="STUDY",
         help=f"{', '.join(STUDIES)}, by default all of these; beyond the paper: {', '.join(FURTHER)}; "
         "speed, which times the filter against others; board, which runs exported controllers on an emulated microcontroller; "
-        "sweep, which runs a grid; soak, which runs controllers for very long; or benchmark, which scores them and others on the "
-        "same tasks; the last three have options of their own "
-        "(sweep --help)",
+        "sweep, which runs a grid; soak, which runs controllers for very long; or benchmark, which scores them and others "
+        "on the same tasks; the last three have options of their own (sweep --help)",
     )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
