@@ -233,8 +233,9 @@ def _power(rows: Sequence[MismatchRow]) -> Claim:
 
 
 def _table(rows: Sequence[MismatchRow], stem: str, caption: str, tuned_with: str, figure: str) -> Table:
-    caption, keys = f"{caption}, tuned with the {tuned_with}", {"paths": "path", "noise": "noise", "mismatch": "point"}
-    return figure_table(stem, caption, select(rows, tuned_with=tuned_with), figure, keys, ALGORITHMS)
+    keys = {"paths": "path", "noise": "noise", "mismatch": "point"}
+    chosen = select(rows, tuned_with=tuned_with)
+    return figure_table(stem, f"{caption}, tuned with the {tuned_with}", chosen, figure, keys, ALGORITHMS)
 
 
 def _figure(rows: Sequence[MismatchRow], case: Case) -> FigureItem:

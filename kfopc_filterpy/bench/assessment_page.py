@@ -45,9 +45,18 @@ def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Pat
     """Write the page, the figures, the sounds and verdict.json into a folder; return the path of the page."""
     require_page()
     path, volts = Path(folder), verdict.volts_per_unit
-    parts: dict[str, Any] = {"figures": list(_figures(verdict)), "sounds": _sounds(verdict)}
     rated_power = float(np.max(verdict.limits.rated_power))  # which this page does not show
-    study = StudyReport("verdict", "Verdict", "", verdict.fs, rated_power, {}, tables=list(_tables(verdict)), **parts)
+    study = StudyReport(
+        "verdict",
+        "Verdict",
+        "",
+        verdict.fs,
+        rated_power,
+        {},
+        figures=list(_figures(verdict)),
+        tables=list(_tables(verdict)),
+        sounds=_sounds(verdict),
+    )
     write_files(study, path)
     write_whole(path / "verdict.json", verdict.json + "\n")
     origin = {
