@@ -56,7 +56,7 @@ class Task(Scene):
         Primary path, for entries that are designed by a measurement of it.
     changed_at_s : float
         Time of the change of the plant; 0 if nothing changes.
-    secondary_gain : float
+    secondary_factor : float
         Factor by which the change multiplies the secondary path. Controllers know the path before it.
     """
 
@@ -66,21 +66,21 @@ class Task(Scene):
     block: int = 0
     primary: Any = None
     changed_at_s: float = 0.0
-    secondary_gain: float = 1.0
+    secondary_factor: float = 1.0
 
     def run(self, controller: Controller, seed_index: int = 0, **options: Any) -> SimulationResult:
         """Run a controller; one with `plays_blocks` delays its control signal itself."""
         delay = self.block if getattr(controller, "plays_blocks", False) else 0
         path: Any = self.secondary[..., delay:]
-        if self.secondary_gain != 1.0:
-            path = [(0.0, path), (self.changed_at_s, self.secondary_gain * path)]
+        if self.secondary_factor != 1.0:
+            path = [(0.0, path), (self.changed_at_s, self.secondary_factor * path)]
         return super().run(controller, seed_index, secondary_path=path, **options)
 
     def run_together(
         self, controllers: Sequence[CoreController], seed_index: int = 0, **options: Any
     ) -> list[SimulationResult]:
         """Run controllers that share their gains; one after the other if the secondary path changes."""
-        if self.secondary_gain == 1.0:
+        if self.secondary_factor == 1.0:
             return super().run_together(controllers, seed_index, **options)
         return [self.run(controller, seed_index, **options) for controller in controllers]
 
@@ -91,7 +91,7 @@ class Task(Scene):
             bound = power_constrained_wiener(
                 x,
                 d,
-                self.secondary_gain * self.secondary,
+                self.secondary_factor * self.secondary,
                 self.n_taps,
                 self.rated_power,
                 fs=self.fs,
@@ -182,18 +182,18 @@ def read_task(path: Path) -> Task:
         sensor_noise_db=SENSOR_NOISE_DB,
         nse_window_s=NSE_WINDOW_S,
     )
-    change = {"at_s": 0.0, "primary_gain": 1.0, "secondary_gain": 1.0} | said.get("change", {})
+    change = {"at_s": 0.0, "primary_factor": 1.0, "secondary_factor": 1.0} | said.get("change", {})
     for d in scene.disturbances:
-        d[..., round(change["at_s"] * fs) :] *= change["primary_gain"]
+        d[..., round(change["at_s"] * fs) :] *= change["primary_factor"]
     return Task(
-        **vars(scene),
+        **vars(scene) | {"secondary_path_uncertainty": said.get("path_error")},
         name=path.stem,
         title=said["title"],
         digest=digest_of(path),
         block=block,
         primary=primary,
         changed_at_s=change["at_s"],
-        secondary_gain=change["secondary_gain"],
+        secondary_factor=change["secondary_factor"],
     )
 
 
