@@ -134,7 +134,7 @@ def test_the_words() -> None:
 
 
 def test_what_is_refused() -> None:
-    with pytest.raises(ValueError, match="delay of a sample at least"):
+    with pytest.raises(ValueError, match="delay of at least one sample"):
         feedback_margin([1.0], [0.5, 1.0], fs=FS)
     with pytest.raises(ValueError, match="internal_model_margin takes one channel"):
         internal_model_margin([1.0], np.ones((1, 1, 4)), fs=FS)
