@@ -25,7 +25,10 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
     multiplier). The other bands adapt as without limits. With the spectrum Y of the block's control signal, the powers :math:`p_b` in the bands, their limits
     :math:`\rho_b` and the gain :math:`G_b = E|X'|^2 / E|X|^2` in a band,
 
-    .. math:: W \leftarrow W + \mu\, C\big\{M\, C\{M^* (X'^* E - \lambda X^* Y)\}\big\}, \qquad
+    .. math::
+
+       W \leftarrow W + \mu\, C\big\{M\, C\{M^* (X'^* E - \lambda X^* Y)\}\big\},
+
        |M|^{-2} = \sum_p |X'_p|^2 + \lambda |X_p|^2
 
     .. math:: \lambda_b \leftarrow \max\Big\{\lambda_b + \frac{\mu}{16}\, G_b \Big(\frac{p_b}{\rho_b} - 1\Big),\ 0\Big\}

@@ -19,8 +19,13 @@ class FrequencyDomainFxLMS(BlockController):
     With :math:`X'_p` the spectrum of the filtered reference that partition p of the control filter sees, and E that of the
     block's errors after zeros,
 
-    .. math:: W_p \leftarrow W_p + \mu\, C\big\{M\, C\{M^* X_p'^* E\}\big\}, \qquad
-       |M|^2 = \frac{1}{\Lambda}, \qquad \Lambda = \sum_p |X'_p|^2
+    .. math::
+
+       W_p \leftarrow W_p + \mu\, C\big\{M\, C\{M^* X_p'^* E\}\big\},
+
+       |M|^2 = \frac{1}{\Lambda},
+
+       \Lambda = \sum_p |X'_p|^2
 
     C is the gradient constraint: in the time domain, the taps beyond the partition are set to zero. M is causal, the minimum-phase
     factor of the step. With it, all bins converge at about the same rate, whatever the colour of the noise, and the

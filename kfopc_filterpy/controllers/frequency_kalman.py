@@ -19,11 +19,19 @@ class FrequencyDomainKalman(FrequencyDomainFxLMS):
     with a variance :math:`P_p` in each bin, and to grow from block to block. With :math:`X'_p` the spectra of the filtered
     reference, E that of :math:`\hat d - w^T x'` in the block, its mean power :math:`\Psi`, and :math:`b = B/(N+B)`,
 
-    .. math:: P_p \leftarrow A^2 P_p + (1 - A^2) |W_p|^2, \qquad
+    .. math::
+
+       P_p \leftarrow A^2 P_p + (1 - A^2) |W_p|^2,
+
        \mu_p = \frac{P_p}{b \sum_p |X'_p|^2 P_p + \Psi}
 
-    .. math:: W_p \leftarrow W_p + C\big\{M_p\, C\{M_p^* X_p'^* E\}\big\},
-       \qquad |M_p|^2 = \mu_p, \qquad P_p \leftarrow (1 - b\, \mu_p |X'_p|^2)\, P_p
+    .. math::
+
+       W_p \leftarrow W_p + C\big\{M_p\, C\{M_p^* X_p'^* E\}\big\},
+
+       |M_p|^2 = \mu_p,
+
+       P_p \leftarrow (1 - b\, \mu_p |X'_p|^2)\, P_p
 
     Parameters
     ----------

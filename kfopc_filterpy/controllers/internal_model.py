@@ -16,7 +16,11 @@ def with_internal_model(controller: _Made) -> _Made:
     The internal model computes the disturbance at each error microphone from the error there and from what the loudspeakers
     play. Its last sample is a reference of the controller:
 
-    .. math:: x_k(n) = \hat d_k(n - 1), \qquad \hat d_k(n) = e_k(n) + \sum_j (\hat s_{kj} * y_j)(n)
+    .. math::
+
+       x_k(n) = \hat d_k(n - 1),
+
+       \hat d_k(n) = e_k(n) + \sum_j (\hat s_{kj} * y_j)(n)
 
     The error e(n) is only known after y(n) has been played, so the newest sample is that of n - 1. With an exact estimate
     of the secondary path, the controller is that of a feedforward system whose reference is d(n - 1): it predicts the

@@ -68,7 +68,11 @@ def band_subfilters(control_filter: ArrayLike, n_bands: int = 15) -> np.ndarray:
 class SubfilterKalman(BlockProcessing, Checkpointed):
     r"""A fixed bank of sub-filters, mixed by gains that a Kalman filter of as many states finds.
 
-    .. math:: y = \sum_c g_c\,(w_c * x), \qquad \hat d = \sum_c g_c\,(\hat s * w_c * x) + \text{noise}
+    .. math::
+
+       y = \sum_c g_c\,(w_c * x),
+
+       \hat d = \sum_c g_c\,(\hat s * w_c * x) + \text{noise}
 
     The gains are a random walk (eq. 1-8 with the filtered outputs of the sub-filters as the row). There are far fewer
     gains than taps, so they are found within some tens of milliseconds. The noise reduction is limited by what the
@@ -78,7 +82,13 @@ class SubfilterKalman(BlockProcessing, Checkpointed):
     With a rated power, the gains are reduced to those of the least expected error within it. With R and H, the running
     means of the products of the sub-filters' outputs, before and after the secondary path, these are
 
-    .. math:: (H + \lambda R)\,g' = H g, \qquad \lambda \ge 0, \qquad g'^T R\,g' \le \rho_o.
+    .. math::
+
+       (H + \lambda R)\,g' = H g,
+
+       \lambda \ge 0,
+
+       g'^T R\,g' \le \rho_o.
 
     The Kalman filter itself goes on with the gains g.
 
