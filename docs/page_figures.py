@@ -150,8 +150,16 @@ def feedback() -> Figure:
     """Return the noise reduction of feedback control against the delay of the secondary path."""
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     ax = figure.subplots()
+    limits = {
+        "closed form": ("k--", "best predictor, without a limit"),
+        "bound": ("k-", "bound within the rated power"),
+    }
     for name, reductions in predictions().items():
-        ax.plot(reductions, {"closed form": "k--", "bound": "k-"}.get(name, "o"), label=name)
+        if name in limits:
+            line, label = limits[name]
+            ax.plot(reductions, line, label=label)
+        else:
+            ax.plot(reductions, label=name, **curve_style(name) | {"linestyle": "none"})
     ax.set(xlabel="Delay of the secondary path (samples)", ylabel="Noise reduction (dB)")
     ax.legend(frameon=False)
     ax.grid(alpha=0.3)

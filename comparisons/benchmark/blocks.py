@@ -20,7 +20,7 @@ TIMEOUT_S = 120.0  # of a run
 FLOAT = np.dtype("<f8")
 
 
-class BlockController(ABC):
+class PlaysBlocks(ABC):
     """A controller that hears a block and then computes the control signals that are played during the next one.
 
     That is the delay with which a task's secondary path begins; see `Task.run`.
@@ -60,7 +60,7 @@ class EntryFailed(RuntimeError):
     """A command ended early, took too long, or gave an answer that is no block of finite numbers."""
 
 
-class CommandController(BlockController):
+class CommandController(PlaysBlocks):
     """A command that computes the control signals: a line of JSON to its stdin, then blocks both ways.
 
     Use it in a ``with`` statement, which ends the command.

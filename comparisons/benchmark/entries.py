@@ -19,7 +19,7 @@ from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.controllers import SubfilterKalman, band_subfilters
 from kfopc_filterpy.controllers.channel_samples import ChannelFilters
 
-from .blocks import BlockController
+from .blocks import PlaysBlocks
 from .tasks import Task
 
 STEPS = (1.0, 0.25, 1 / 16, 1 / 64)  # fewer than for our own: a sample takes more than a hundred times as long
@@ -137,7 +137,7 @@ def _aspsim_nlms(n_taps: int, path: np.ndarray, *, step_size: float, regularizat
     )
 
 
-class AdafiltBlocks(BlockController):
+class AdafiltBlocks(PlaysBlocks):
     """adafilt's `MultiChannelBlockLMS`, which is filtered-x LMS in blocks for any number of channels."""
 
     def __init__(

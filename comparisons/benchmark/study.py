@@ -169,7 +169,7 @@ def table(outcome: Mapping[str, Any]) -> str:
         settings = "" if one.setting is None else ", ".join(f"{value:.3g}" for value in np.ravel(one.setting))
         lost = f"{one.below_bound_db:.2f}" if one.within_rating else "over"
         lines.append(
-            f"{one.entry:31}{one.noise_reduction_db:8.2f}{lost:>10}{one.power:8.2f}{one.loudest_second_db:11.2f}"
+            f"{one.entry:31}{one.noise_reduction_db:8.2f}{lost:>10} {one.power:7.2f}{one.loudest_second_db:11.2f}"
             f"{one.time_s:14.3f}{one.cost:8.1f}  {settings}"
         )
     return "\n".join(lines)

@@ -384,12 +384,13 @@ def _read_signals(
     heard = ("disturbance", disturbance) if reference is None else ("reference", reference)
     signal = np.atleast_2d((as_channels if several else as_signal)(heard[1], heard[0]))
     x = signal[:0] if reference is None else signal
-    if disturbance is not None and not np.array_equal(noise_level_db, 0.0):
+    louder = not np.array_equal(noise_level_db, 0.0)
+    if disturbance is not None and louder:
         raise ValueError(
             "noise_level_db needs primary_path=, so that the disturbance follows; if you give the disturbance, scale "
             "both signals yourself, with signals.level_jump for example"
         )
-    if noise_level_db != 0.0:
+    if louder:
         x = x * noise_gain(noise_level_db, x.shape[1], fs, crossfade_s)
 
     def read(paths: Any) -> np.ndarray:
