@@ -16,7 +16,7 @@ __getattr__ = naming_removed(
         "HealthEvent": "PathEvent, of VerifiedController",
         "PathTracker": VERIFIED,
         "PathChange": "PathEvent, of VerifiedController",
-        "FrequencyDomainKalman": "kf_pb, which is one form for all channels",
+        "FrequencyDomainKalman": "kf_pb, which keeps a rated power as it did; kfopc_filterpy.FrequencyDomainKalman is new and keeps none",
         "SharedGainKalman": "kf_pb, which is one form for all channels",
     },
 )
