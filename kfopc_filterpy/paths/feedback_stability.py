@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.polynomial.polynomial import polysub
 from numpy.typing import ArrayLike
 
-from .._types import PathModel
-from .._validate import as_positive, as_real_array
-from .models import path_taps, sampling_rate
-from .path_matrix import is_path_matrix
+from .._types import PathModels
+from .._validate import as_real_array
+from .path_matrix import SECONDARY_AXES, path_matrix, sampled_path_matrix
 
 if TYPE_CHECKING:
     import control
@@ -45,9 +44,18 @@ class FeedbackMargin:
         complementary sensitivity T (skew -1); Inf if there is no loop, and 0 if the loop is unstable.
     path_error_hz : float
         Frequency in Hz at which the tolerated error is smallest.
-    loop : control.TransferFunction
-        Loop transfer function in python-control's convention: ``1 / (1 + loop)`` is the sensitivity. ``-w (f - f^)`` for
-        acoustic feedback.
+    paths : tuple of ndarray
+        Control filter (J, K, taps), path (K, J, taps) and estimate of the path, between which the loop is closed.
+    fs : float
+        Sampling rate in Hz.
+
+    Notes
+    -----
+    With several channels, delta is a matrix that multiplies the path from either side: errors of the microphones, or of the
+    loudspeakers. ``|delta|`` is its largest singular value, and ``|T|`` the larger one of those of T, with the loop
+    opened at the microphones or at the loudspeakers. So all channels may be wrong at once, in any way. The disk margin
+    holds for factors of all microphones, or of all loudspeakers, that differ. It is at most that of
+    `control.disk_margins`, which uses the structured singular value, and needs slycot for several channels.
     """
 
     stable: bool
@@ -57,7 +65,8 @@ class FeedbackMargin:
     frequency_hz: float
     path_error: float
     path_error_hz: float
-    loop: control.TransferFunction
+    paths: tuple[np.ndarray, np.ndarray, np.ndarray] = field(compare=False)
+    fs: float
 
     def __repr__(self) -> str:
         if not self.stable:
@@ -68,21 +77,39 @@ class FeedbackMargin:
             f"{100 * self.path_error:.3g} % at {self.path_error_hz:.4g} Hz>"
         )
 
+    @property
+    def loop(self) -> control.TransferFunction:
+        """Loop transfer function of one channel, in python-control's convention: ``1 / (1 + loop)`` is the sensitivity.
+
+        ``-w (f - f^)`` for acoustic feedback. With several channels it raises ValueError.
+        """
+        from control import TransferFunction
+
+        if any(taps.shape[:2] != (1, 1) for taps in self.paths):
+            raise ValueError("loop is that of one channel: with several, use path_error_at, or the filters in paths")
+        w, path, estimate = (taps[0, 0] for taps in self.paths)
+        above, below = np.convolve(w, path), polysub([1.0], np.convolve(w, estimate))
+        n = max(above.size, below.size)
+        return TransferFunction(*(np.pad(taps, (0, n - taps.size)) for taps in (above, below)), 1 / self.fs)
+
     def path_error_at(self, frequencies_hz: ArrayLike) -> np.ndarray:
         """Return the relative error of the path that the loop tolerates at each of `frequencies_hz`, (n_frequencies,).
 
-        Each value is ``1/|T| = |1 + 1/loop|``, which is meaningful only for a stable loop.
+        Each value is ``1/|T|``, which is meaningful only for a stable loop.
         """
-        omega = 2 * np.pi * np.atleast_1d(as_real_array(frequencies_hz, "frequencies_hz"))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = 1.0 / self.loop(np.exp(1j * omega * self.loop.dt))
-        return np.where(np.isfinite(inverse), np.abs(1.0 + inverse), np.inf)
+        turns = np.outer(
+            as_real_array(frequencies_hz, "frequencies_hz"), np.arange(max(t.shape[2] for t in self.paths))
+        )
+        waves = np.exp(-2j * np.pi / self.fs * turns)
+        responses = [np.moveaxis(taps @ waves[:, : taps.shape[2]].T, -1, 0) for taps in self.paths]
+        with np.errstate(divide="ignore"):
+            return 1.0 / _largest(0.0, *responses)
 
 
 def feedback_margin(
-    control_filter: PathModel,
-    feedback_path: PathModel,
-    feedback_estimate: PathModel | None = None,
+    control_filter: PathModels,
+    feedback_path: PathModels,
+    feedback_estimate: PathModels | None = None,
     *,
     fs: float | None = None,
 ) -> FeedbackMargin:
@@ -98,9 +125,9 @@ def feedback_margin(
 
     Parameters
     ----------
-    control_filter : array_like, shape (n_taps,)
+    control_filter : array_like, shape (n_taps,) or (J, I, n_taps)
         Control filter w, for example `control_filter` of a controller.
-    feedback_path : array_like or control.TransferFunction
+    feedback_path : array_like, shape (n_path,) or (I, J, n_path), or control.TransferFunction
         Path f from the loudspeaker to the reference microphone; its first tap must be 0.
     feedback_estimate : array_like or control.TransferFunction, optional
         Estimate of this path, which is subtracted; by default none.
@@ -115,17 +142,19 @@ def feedback_margin(
     Raises
     ------
     TypeError, ValueError
-        Several channels, paths without a delay, or different sampling rates.
+        Numbers of channels that do not fit each other, paths without a delay, or different sampling rates.
 
     Notes
     -----
-    The loop has a finite impulse response, so by Nyquist's criterion it is stable if ``1 - W (F - F^)`` does not
-    encircle the origin. The margins are those of `control.disk_margins` at the worst frequency of a grid with a spacing
-    of fs/65536 or less. The adaptation changes w, so the margin holds for this control filter only.
+    The loop has a finite impulse response, so by Nyquist's criterion it is stable if ``1 - W (F - F^)``, with several
+    channels the determinant of ``I - (F - F^) W``, does not encircle the origin. The margins are those at the worst
+    frequency of a grid with a spacing of fs/65536 or less. The adaptation changes w, so the margin holds for this
+    control filter only.
 
     References
     ----------
     P. Seiler, A. Packard, P. Gahinet, "An introduction to disk margins", IEEE Control Systems Magazine 40(5), 2020.
+    S. Skogestad, I. Postlethwaite, Multivariable Feedback Control, 2nd ed., Wiley 2005, sections 4.9 and 8.6.
 
     Examples
     --------
@@ -140,22 +169,23 @@ def feedback_margin(
     >>> feedback_margin([2.0], [0.0, 1.0], fs=8000.0)
     <FeedbackMargin: unstable>
     """
-    if is_path_matrix(feedback_path) or is_path_matrix(feedback_estimate) or np.ndim(control_filter) > 1:
-        raise ValueError("feedback_margin takes one channel: give a filter and paths of one axis, (taps,)")
-    fs = as_positive(sampling_rate(feedback_path, fs, name="feedback_path"), "fs", unit="Hz")
-    w, left = path_taps(control_filter, name="control_filter"), path_taps(feedback_path, name="feedback_path")
-    if feedback_estimate is not None:
-        sampling_rate(feedback_estimate, fs, name="feedback_estimate")
-        left = polysub(left, path_taps(feedback_estimate, name="feedback_estimate"))
-    if left[0] != 0.0:
-        raise ValueError(f"feedback_path must have a delay of at least one sample: a first tap is {left[0]:g}, not 0")
-    return _margin(-np.convolve(w, left), np.ones(1), fs)
+    f, fs = sampled_path_matrix(feedback_path, fs, "feedback_path", "(I references, J loudspeakers, taps)")
+    estimate = _estimate(feedback_estimate, np.zeros_like(f), fs, "feedback_estimate")
+    w, _ = path_matrix(control_filter, fs=fs, name="control_filter")
+    _require_fit(w, f, w.shape[1])
+    left = np.zeros((*f.shape[:2], max(f.shape[2], estimate.shape[2])))
+    left[..., : f.shape[2]] += f
+    left[..., : estimate.shape[2]] -= estimate
+    for first in left[..., 0].flat:
+        if first != 0.0:
+            raise ValueError(f"feedback_path must have a delay of at least one sample: a first tap is {first:g}, not 0")
+    return _margin(w, -left, np.zeros_like(left[..., :1]), fs)
 
 
 def internal_model_margin(
-    control_filter: PathModel,
-    secondary_path: PathModel,
-    secondary_estimate: PathModel | None = None,
+    control_filter: PathModels,
+    secondary_path: PathModels,
+    secondary_estimate: PathModels | None = None,
     *,
     fs: float | None = None,
 ) -> FeedbackMargin:
@@ -168,13 +198,15 @@ def internal_model_margin(
        \frac{1}{1 + L} = \frac{1 - z^{-1} W \hat S}{1 + z^{-1} W (S - \hat S)}
 
     With an exact estimate it is stable for any W, and :math:`T = z^{-1} W \hat S`: a path that is wrong by the factor
-    :math:`1 + \delta` is safe where :math:`|\delta| < 1/|T|`.
+    :math:`1 + \delta` is safe where :math:`|\delta| < 1/|T|`. With several channels, W, S and :math:`\hat S` are
+    matrices, and the denominator is :math:`\det(I + z^{-1} (S - \hat S) W)`.
 
     Parameters
     ----------
-    control_filter : array_like, shape (n_taps,)
-        Settled control filter w: `control_filter` of a feedback controller, or the last row of a hybrid controller's.
-    secondary_path : array_like or control.TransferFunction
+    control_filter : array_like, shape (n_taps,) or (J, K, n_taps)
+        Settled control filter w: `control_filter` of a feedback controller. Of a hybrid controller's, (J, I + K, n_taps), the
+        last K are used, those for the disturbances.
+    secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control.TransferFunction
         True path s from the loudspeaker to the error microphone.
     secondary_estimate : array_like or control.TransferFunction, optional
         The controller's estimate of this path; by default the path itself.
@@ -189,7 +221,7 @@ def internal_model_margin(
     Raises
     ------
     TypeError, ValueError
-        Several channels, or different sampling rates.
+        Numbers of channels that do not fit each other, or different sampling rates.
 
     Notes
     -----
@@ -201,38 +233,84 @@ def internal_model_margin(
     times as large as its estimate:
 
     >>> from kfopc_filterpy.paths import internal_model_margin
-    >>> internal_model_margin([0.5], [0.0, 1.0], fs=8000.0).path_error
+    >>> internal_model_margin([0.5], [0.0, 1.0], fs=8000.0).path_error.__round__(9)
     2.0
     >>> internal_model_margin([0.5], [0.0, 2.9], [0.0, 1.0], fs=8000.0).stable
     True
     >>> internal_model_margin([0.5], [0.0, 3.1], [0.0, 1.0], fs=8000.0).stable
     False
+
+    Two such loops, with loudspeakers that are both heard at both microphones: the gain doubles where the disturbances are
+    equal.
+
+    >>> import numpy as np
+    >>> filters, path = np.zeros((2, 2, 2, 2))
+    >>> filters[..., 0], path[..., 1] = 0.5 * np.eye(2), 1.0
+    >>> internal_model_margin(filters, path, fs=8000.0).path_error.__round__(9)
+    1.0
     """
-    if is_path_matrix(secondary_path) or is_path_matrix(secondary_estimate) or np.ndim(control_filter) > 1:
-        raise ValueError("internal_model_margin takes one channel: give a filter and paths of one axis, (taps,)")
-    fs = as_positive(sampling_rate(secondary_path, fs, name="secondary_path"), "fs", unit="Hz")
-    delayed = np.concatenate(([0.0], path_taps(control_filter, name="control_filter")))
-    path = estimate = path_taps(secondary_path, name="secondary_path")
-    if secondary_estimate is not None:
-        sampling_rate(secondary_estimate, fs, name="secondary_estimate")
-        estimate = path_taps(secondary_estimate, name="secondary_estimate")
-    return _margin(np.convolve(delayed, path), polysub([1.0], np.convolve(delayed, estimate)), fs)
+    s, fs = sampled_path_matrix(secondary_path, fs, "secondary_path", SECONDARY_AXES)
+    estimate = _estimate(secondary_estimate, s, fs, "secondary_estimate")
+    w, _ = path_matrix(control_filter, fs=fs, name="control_filter")
+    _require_fit(w, s, min(w.shape[1], len(s)))
+    return _margin(np.pad(w[:, -len(s) :], ((0, 0), (0, 0), (1, 0))), s, estimate, fs)
 
 
-def _margin(numerator: np.ndarray, denominator: np.ndarray, fs: float) -> FeedbackMargin:
-    """Return the margins of the loop ``numerator / denominator``, both in taps, whose closed loop is the inverse of an FIR filter."""
-    from control import TransferFunction, disk_margins
+def _estimate(paths: PathModels | None, default: np.ndarray, fs: float, name: str) -> np.ndarray:
+    """Return the estimate of a path as taps, with the channels of the `default`."""
+    estimate = default if paths is None else path_matrix(paths, fs=fs, name=name)[0]
+    if estimate.shape[:2] != default.shape[:2]:
+        raise ValueError(f"{name} must have the channels of the path, {default.shape[:2]}, got {estimate.shape[:2]}")
+    return estimate
 
-    n = max(numerator.size, denominator.size)
-    above, below = (np.pad(taps, (0, n - taps.size)) for taps in (numerator, denominator))
-    loop = TransferFunction(above, below, 1 / fs)
-    size = max(_GRID, 2 ** int(np.ceil(np.log2(_POINTS_PER_TAP * n))))
-    over, under = (np.fft.rfft(taps, size) for taps in (above, below))
-    turned = np.unwrap(np.angle(over + under))
-    if round((turned[-1] - turned[0]) / np.pi) != 0:
-        return FeedbackMargin(False, 0.0, 0.0, 0.0, np.nan, 0.0, np.nan, loop)
-    worst = [int(np.argmax(np.abs(part / (over + under)))) for part in (0.5 * (under - over), over)]
-    frequency, error_hz = (float(at * fs / size) for at in worst)
-    margin, gain_db, phase_deg = disk_margins(loop, np.array([2 * np.pi * frequency]))
-    found = FeedbackMargin(True, float(margin), float(gain_db), float(phase_deg), frequency, np.inf, error_hz, loop)
-    return replace(found, path_error=float(found.path_error_at(error_hz)[0])) if np.any(above) else found
+
+def _require_fit(w: np.ndarray, path: np.ndarray, n_inputs: int) -> None:
+    """Raise ValueError if a control filter and its path cannot form a loop over so many of the filter's inputs."""
+    K, J, _ = path.shape
+    if (len(w), n_inputs) != (J, K):
+        raise ValueError(
+            f"control_filter must be ({J} loudspeakers, {K} microphones, taps) for a path from {J} loudspeaker(s) to {K} "
+            f"microphone(s), got {w.shape}"
+        )
+
+
+def _margin(w: np.ndarray, path: np.ndarray, estimate: np.ndarray, fs: float) -> FeedbackMargin:
+    """Return the margins of the loop from `w`, (J, K, taps), through the difference of path and estimate, (K, J, taps)."""
+    paths = (w, path, estimate)
+    n_taps = len(path) * (w.shape[2] + max(path.shape[2], estimate.shape[2]))  # of the determinant, at most
+    size = max(_GRID, 2 ** int(np.ceil(np.log2(_POINTS_PER_TAP * n_taps))))
+    responses = [np.moveaxis(np.fft.rfft(taps, size), -1, 0) for taps in paths]
+    determinant = np.linalg.det(_returned(*responses))
+    turned = np.unwrap(np.angle(determinant))
+    if not np.all(determinant) or round((turned[-1] - turned[0]) / np.pi) != 0:
+        return FeedbackMargin(False, 0.0, 0.0, 0.0, np.nan, 0.0, np.nan, paths, fs)
+    balanced, complementary = (_largest(centre, *responses) for centre in (0.5, 0.0))
+    worst, most_wrong = np.argmax(balanced), np.argmax(complementary)
+    disk = min(1.0 / float(balanced[worst]), 2.0)
+    with np.errstate(divide="ignore"):
+        return FeedbackMargin(
+            stable=True,
+            disk_margin=disk,
+            gain_margin_db=float(20.0 * np.log10(np.divide(2.0 + disk, 2.0 - disk))),
+            phase_margin_deg=float(np.rad2deg(2.0 * np.arctan(disk / 2.0))),
+            frequency_hz=float(worst * fs / size),
+            path_error=float(1.0 / complementary[most_wrong]),
+            path_error_hz=float(most_wrong * fs / size),
+            paths=paths,
+            fs=fs,
+        )
+
+
+def _returned(w: np.ndarray, path: np.ndarray, estimate: np.ndarray) -> np.ndarray:
+    """Return ``I + (S - S^) W`` at each frequency, (n_frequencies, K, K), from responses with the frequencies first."""
+    return np.eye(path.shape[1]) + (path - estimate) @ w
+
+
+def _largest(centre: float, w: np.ndarray, path: np.ndarray, estimate: np.ndarray) -> np.ndarray:
+    """Return the largest singular value of ``centre I - T`` at each frequency, seen from microphones or loudspeakers."""
+    driven = w @ np.linalg.inv(_returned(w, path, estimate))  # control signals for a disturbance of 1
+    norms = []
+    for T in (path @ driven, driven @ path):
+        matrix = centre * np.eye(T.shape[1]) - T
+        norms.append(np.linalg.norm(matrix, 2 if T.shape[1] > 1 else None, axis=(1, 2)))
+    return np.maximum(*norms)

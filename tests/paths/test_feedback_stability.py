@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from typing import Any
 
 import control
 import numpy as np
@@ -109,23 +110,110 @@ def test_the_margins_are_those_of_python_control_and_the_poles() -> None:
     assert outcomes == {True, False}
 
 
-def test_a_settled_controller_is_unstable_where_its_margin_ends() -> None:
+@pytest.mark.parametrize("gains", [0.9, [[0.9, 0.4], [0.3, -0.8]]])
+def test_a_settled_controller_is_unstable_where_its_margin_ends(gains: Any) -> None:
     """The gain of the path grows until the margin says unstable; just below, a run of the frozen controller dies away."""
-    s = np.array([0.0, 0.9])
-    controller = with_internal_model(FxLMS(8, s, step_size=0.01))
-    d = np.sin(0.3 * np.arange(4000)) + 0.3 * np.random.default_rng(0).standard_normal(4000)
+    gains = np.array(gains)
+    s = np.stack((np.zeros_like(gains), gains), axis=-1)
+    controller = with_internal_model(FxLMS(8, s, step_size=0.01, n_references=len(np.atleast_1d(gains))))
+    d = np.sin(0.3 * np.arange(4000)) + 0.3 * np.random.default_rng(0).standard_normal((*gains.shape[:1], 4000))
     simulate(controller, None, disturbance=d, secondary_path=s)
-    gains = np.arange(1.0, 10.0, 0.02)
-    stable = [internal_model_margin(controller.control_filter, g * s, s, fs=FS).stable for g in gains]
-    end = gains[stable.index(False)]
-    assert end - 1.0 >= internal_model_margin(controller.control_filter, s, fs=FS).path_error - 0.02
-    for gain, dies in ((0.97 * end, True), (1.03 * end, False)):
-        frozen, loudest, y = deepcopy(controller), [], 0.0
+
+    def stable(gain: float) -> bool:
+        return internal_model_margin(controller.control_filter, gain * s, s, fs=FS).stable
+
+    inside, outside = 1.0, 20.0
+    assert stable(inside)
+    assert not stable(outside)
+    while outside - inside > 0.01:
+        middle = (inside + outside) / 2
+        inside, outside = (middle, outside) if stable(middle) else (inside, middle)
+    assert outside - 1.0 >= internal_model_margin(controller.control_filter, s, fs=FS).path_error
+    for gain, dies in ((0.97 * inside, True), (1.03 * outside, False)):
+        frozen, loudest, y = deepcopy(controller), [], np.zeros(gains.shape[:1])
         for n in range(2000):
-            e = float(n == 0) - gain * 0.9 * y  # y of the sample before
-            y = frozen.process(None, [e], adapt=False)[0]
-            loudest.append(abs(e))
+            e = float(n == 0) - gain * np.dot(gains, y)  # y of the sample before
+            y = frozen.process(None, e[..., np.newaxis], adapt=False)[..., 0]
+            loudest.append(np.abs(e).max())
         assert (max(loudest[-100:]) < max(loudest[100:200])) == dies
+
+
+# Several channels.
+
+
+def random_loop(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Return a control filter, a path with a delay and an estimate of it, of one channel."""
+    s = np.append(0.0, rng.standard_normal(4))
+    return 0.3 * rng.standard_normal(6), s, s + 0.3 * rng.standard_normal(5)
+
+
+def side_by_side(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.array([[one, np.zeros_like(one)], [np.zeros_like(other), other]])
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7])
+def test_loops_side_by_side_have_the_lesser_margin_and_turned_microphones_do_not_change_it(angle: float) -> None:
+    """Microphones that hear sums of the signals, by an orthogonal matrix, and filters that undo this."""
+    rng, outcomes = np.random.default_rng(0), set()
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    for _ in range(12):
+        loops = random_loop(rng), random_loop(rng)
+        alone = [internal_model_margin(*loop, fs=FS) for loop in loops]
+        w, s, estimate = (side_by_side(*both) for both in zip(*loops, strict=True))
+        margin = internal_model_margin(
+            np.einsum("jct,kc->jkt", w, turn), *(np.einsum("kc,cjt->kjt", turn, path) for path in (s, estimate)), fs=FS
+        )
+        outcomes.add(margin.stable)
+        assert margin.stable == all(one.stable for one in alone)
+        for name in ("disk_margin", "path_error", "gain_margin_db", "phase_margin_deg"):
+            least = min(getattr(one, name) for one in alone) if margin.stable else 0.0
+            assert getattr(margin, name) == pytest.approx(least, rel=1e-9)
+        if margin.stable:
+            least_at = np.min([one.path_error_at([100.0, 3000.0]) for one in alone], axis=0)
+            np.testing.assert_allclose(margin.path_error_at([100.0, 3000.0]), least_at, rtol=1e-9)
+    assert outcomes == {True, False}
+
+
+def test_stability_of_several_channels_is_that_of_the_poles() -> None:
+    """The determinant of I - F W in polynomials, and its zeros."""
+    rng, outcomes = np.random.default_rng(3), set()
+    for _ in range(30):
+        w, f = rng.standard_normal((2, 2, 5)), np.pad(rng.standard_normal((2, 2, 3)), ((0, 0), (0, 0), (1, 0)))
+        w *= rng.uniform(0.02, 0.3)
+        left = [[-sum(np.convolve(f[i, j], w[j, k]) for j in range(2)) for k in range(2)] for i in range(2)]
+        for i in range(2):
+            left[i][i][0] += 1.0
+        determinant = np.convolve(left[0][0], left[1][1]) - np.convolve(left[0][1], left[1][0])
+        stable = bool(np.abs(np.roots(determinant)).max() < 1.0)
+        assert feedback_margin(w, f, fs=FS).stable == stable
+        outcomes.add(stable)
+    assert outcomes == {True, False}
+
+
+@pytest.mark.parametrize(("n_microphones", "n_loudspeakers"), [(2, 2), (1, 3), (3, 1), (2, 3)])
+@pytest.mark.parametrize("side", ["microphones", "loudspeakers"])
+def test_the_tolerated_error_is_the_least_that_makes_the_loop_unstable(
+    n_microphones: int, n_loudspeakers: int, side: str
+) -> None:
+    """One tap each, so T = z^-3 times a constant matrix: its largest singular value is reached by an error of rank one."""
+    rng = np.random.default_rng(4)
+    w, s = np.zeros((n_loudspeakers, n_microphones, 4)), np.zeros((n_microphones, n_loudspeakers, 4))
+    w[..., 1], s[..., 1] = rng.standard_normal(w.shape[:2]), rng.standard_normal(s.shape[:2])
+    constant = s[..., 1] @ w[..., 1] if side == "microphones" else w[..., 1] @ s[..., 1]
+    left, values, right = np.linalg.svd(constant)
+    margin = internal_model_margin(w, s, fs=FS)
+    other = w[..., 1] @ s[..., 1] if side == "microphones" else s[..., 1] @ w[..., 1]
+    assert margin.path_error == pytest.approx(1 / max(values[0], np.linalg.norm(other, 2)), rel=1e-9)
+    for share in (0.99, 1.01):
+        factor = np.eye(len(constant)) + share / values[0] * np.outer(right[0], left[:, 0])
+        wrong = np.einsum("kc,cjt->kjt", factor, s) if side == "microphones" else np.einsum("kct,cj->kjt", s, factor)
+        assert internal_model_margin(w, wrong, s, fs=FS).stable == (share < 1)
+
+
+def test_of_a_hybrid_filter_the_rows_of_the_disturbances_count() -> None:
+    w, s, estimate = random_loop(np.random.default_rng(5))
+    rows = np.stack((np.ones_like(w), w))[np.newaxis]
+    assert internal_model_margin(rows, s, estimate, fs=FS) == internal_model_margin(w, s, estimate, fs=FS)
 
 
 def test_the_words() -> None:
@@ -136,12 +224,16 @@ def test_the_words() -> None:
 def test_what_is_refused() -> None:
     with pytest.raises(ValueError, match="delay of at least one sample"):
         feedback_margin([1.0], [0.5, 1.0], fs=FS)
-    with pytest.raises(ValueError, match="internal_model_margin takes one channel"):
-        internal_model_margin([1.0], np.ones((1, 1, 4)), fs=FS)
+    with pytest.raises(ValueError, match=r"control_filter must be \(2 loudspeakers, 1 microphones"):
+        internal_model_margin(np.ones(4), np.ones((1, 2, 4)), fs=FS)
+    with pytest.raises(ValueError, match="channels of the path"):
+        internal_model_margin([1.0], [0.0, 1.0], np.ones((2, 1, 4)), fs=FS)
+    with pytest.raises(ValueError, match="loop is that of one channel"):
+        _ = internal_model_margin(np.zeros((2, 1, 4)), np.ones((1, 2, 4)), fs=FS).loop
     with pytest.raises(ValueError, match="secondary_estimate"):
         internal_model_margin([1.0], [0.0, 1.0], fir_path([0.0, 1.0], 2 * FS), fs=FS)
-    with pytest.raises(ValueError, match="feedback_margin takes one channel"):
-        feedback_margin(np.ones((1, 1, 4)), [0.0, 1.0], fs=FS)
+    with pytest.raises(ValueError, match="control_filter must be"):
+        feedback_margin(np.ones((1, 2, 4)), [0.0, 1.0], fs=FS)
     with pytest.raises(ValueError, match="fs"):
         feedback_margin([1.0], [0.0, 1.0])
     with pytest.raises(ValueError, match="feedback_estimate"):
