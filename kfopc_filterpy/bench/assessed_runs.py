@@ -37,7 +37,7 @@ class Plan:
     settings: SuggestedSettings
     uncertainty: Any
     bar: Any
-    feedback: bool = False  # x is then what an exact internal model gives
+    feedback: bool = False  # the last references are then what an exact internal model gives
     lock: Any = field(default_factory=threading.Lock)
 
     def outcome(self, name: str, limited: bool) -> SimulationResult | AllDivergedError:
@@ -60,10 +60,13 @@ class Plan:
     def run(self, name: str, *, limited: bool, share: float = 1.0) -> SimulationResult:
         """Run an algorithm, behind a limiter or not, with a share of the rating's power."""
         limits = scaled(self.limits, share)
-        controller = self.controller(name, limits, limited)
+        controller, heard = self.controller(name, limits, limited), self.x
+        if self.feedback:
+            controller = with_internal_model(controller)
+            heard = np.atleast_2d(self.x)[: controller.n_references] if controller.n_references else None
         return simulate(
-            with_internal_model(controller) if self.feedback else controller,
-            None if self.feedback else self.x,
+            controller,
+            heard,
             disturbance=self.d,
             secondary_path=self.s,
             fs=self.fs,

@@ -92,10 +92,10 @@ def assess(
     Parameters
     ----------
     noise : array_like, shape (n_samples,) or (I, n_samples)
-        Recording of the reference microphones, with silent loudspeakers; with `feedback` that of the error microphones.
-        The rate of a `Recording` must be `fs`.
+        Recording of the reference microphones, with silent loudspeakers; without any that of the error microphones, see
+        `feedback`. The rate of a `Recording` must be `fs`.
     primary : array_like, shape (n_path,) or (K, I, n_path), or control.TransferFunction, optional
-        Impulse response from each reference to each error microphone. None if there is a `disturbance`.
+        Impulse response from each reference to each error microphone. None if there is a `disturbance`, or no reference.
     secondary : array_like, shape (n_path,) or (K, J, n_path), or control.TransferFunction
         Impulse response from each control signal to each error microphone.
     rating : float, AmplifierRating, LoudspeakerRating, or a sequence of them
@@ -128,8 +128,9 @@ def assess(
     switch_on_s : float, optional
         Time in s at which the control is switched on; by default 0.5 s, or a tenth of a shorter record.
     feedback : bool, default False
-        Whether there is no reference microphone, as in headphones: the controllers predict the disturbance, see
-        `with_internal_model`. Then `noise` is the disturbance, and `primary` and `disturbance` are None.
+        Whether the controllers also predict the disturbance from its past, see `with_internal_model`: hybrid control. If
+        neither `primary` nor `disturbance` is given, there is no reference microphone, as in headphones, and `noise` is
+        the disturbance.
     bar : tqdm bar, optional
         Bar that advances with the samples that are run, those on which FxLMS is tuned included; its total is set, and it
         is described by what is going on.
@@ -143,8 +144,8 @@ def assess(
     ------
     TypeError, ValueError
         Signals that are not finite, silent, too short for the filter or for a run of 2 s, or of different lengths; paths
-        whose channels do not fit the signals; neither a primary path nor a disturbance, or one of them with `feedback`; a
-        settled feedback loop without a margin, with the secondary path or one that was measured again; a rating that does
+        whose channels do not fit the signals; neither a primary path nor a disturbance without `feedback`; a settled
+        feedback loop without a margin, with the secondary path or one that was measured again; a rating that does
         not limit the mean power, or ratings for another number of loudspeakers; an unknown algorithm.
 
     Notes
@@ -162,9 +163,9 @@ def assess(
     If a loudspeaker's rating has an excursion, the rated power is the largest at which the best fixed filter's control
     signal keeps it.
 
-    With `feedback`, the ceilings are those of predictors: filters of the disturbance one sample late. With one channel,
-    the settled loop is judged by `paths.internal_model_margin`, with the least margin of `secondary` and of the paths that
-    `secondary_path_uncertainty` may hold.
+    With `feedback`, the disturbance one sample late is a reference, also of the ceilings: they are those of predictors, and
+    the coherence is none. The settled loop is judged by `paths.internal_model_margin`, with the least margin of `secondary`
+    and of the paths that `secondary_path_uncertainty` may hold.
 
     With several loudspeakers the required rated powers are in the proportions of the ratings. The coherence is the multiple
     coherence of all references. The causality margin is that of each microphone's earliest loudspeaker, at the worst
@@ -183,12 +184,7 @@ def assess(
     False amplifier
     """
     fs = as_positive(fs, "fs", unit="Hz")
-    if feedback and not (primary is None and disturbance is None):
-        raise ValueError(
-            "feedback=True takes neither primary nor disturbance: noise is the recording of the error microphones"
-        )
-    x, d, s = recorded_signals(noise, primary, secondary, noise if feedback else disturbance, fs, feedback)
-    x = predictor_reference(d) if feedback else x
+    x, d, s = recorded_signals(noise, primary, secondary, disturbance, fs, feedback)
     p = None if primary is None else primary_paths(primary, fs=fs, name="primary")[0]
     several = s.ndim == 3
     K, J, n_references = (*s.shape[:2], len(x)) if several else (1, 1, 1)
@@ -247,9 +243,11 @@ def assess(
             notes.append(f"{name} is left out: {outcome}.")
     run = runs[algorithm]
     reached = _reduction(run)
-    loop = _settled_loop(run, s, secondary_path_uncertainty) if feedback and not several else None
+    loop = _settled_loop(run, s, secondary_path_uncertainty) if feedback else None
     ceilings = Ceilings(
-        coherence_db=None if disturbance is None else max(_coherence_db(bounds.x, bounds.d, fs), bounds.time_db),
+        coherence_db=None
+        if feedback or disturbance is None
+        else max(_coherence_db(bounds.x, bounds.d, fs), bounds.time_db),
         time_db=bounds.time_db,
         filter_db=bounds.filter_db,
         power_db=bounds.limited(limits.rated_power)[1],
@@ -272,13 +270,13 @@ def assess(
     notes += recording_remarks(noise, fs, "noise")
     if disturbance is not None:
         notes += clipping_remarks(disturbance, "disturbance")
-    elif feedback:
-        notes += _on_uncertain_path(loop, s, secondary_path_uncertainty)
-    else:
+    elif primary is not None:
         notes.append(
             "The disturbance was computed from the reference, so the coherence is not checked: record both microphones "
             "together and give the disturbance."
         )
+    notes += _on_uncertain_path(loop, s, secondary_path_uncertainty)
+    n_heard = n_references - K if feedback else n_references
     assessment = Assessment(
         enough=cause is None,
         want_db=want_db,
@@ -305,11 +303,11 @@ def assess(
         volts_per_unit=volts_per_unit,
         ohm=ohm,
         fs=fs,
-        channels=(0 if feedback else n_references, J, K) if several else None,
+        channels=(n_heard, J, K) if several else None,
         pascal_per_unit=pascal_per_unit,
         switch_on_s=start / fs,
         response_s=None if p is None else _response_s(p, s, want_db, fs),
-        feedback=feedback,
+        feedback=n_heard == 0,
         loop=loop,
     )
     return replace(assessment, advice=tuple(advice_on(assessment)))
@@ -325,7 +323,8 @@ def recorded_signals(
 ) -> tuple[np.ndarray, ...]:
     """Return references, disturbances and secondary paths, checked, the recordings without their offsets.
 
-    One channel of everything comes without channel axes.
+    With `feedback`, the disturbances one sample late are the last references, or the only ones if neither `primary` nor
+    `disturbance` is given: `noise` is then the disturbance. One channel of everything comes without channel axes.
     """
     x = _recording(noise, "noise", fs)
     s, _ = secondary_paths(secondary, fs=fs, name="secondary")
@@ -333,12 +332,11 @@ def recorded_signals(
     require_sound("secondary", s)
     if disturbance is not None:
         d = _recording(disturbance, "disturbance", fs, length=x.shape[1])
-        if len(d) != K:
-            raise ValueError(
-                f"disturbance must have a channel for each of the {K} microphones of secondary, got {len(d)}"
-            )
-        if not feedback:
-            require_different("disturbance", d, "noise", x)
+        _require_each_microphone(d, "disturbance", K)
+        require_different("disturbance", d, "noise", x)
+    elif primary is None and feedback:
+        d, x = x, x[:0]
+        _require_each_microphone(d, "noise", K)
     elif primary is None:
         raise ValueError("primary must be given unless there is a disturbance: what arrives at the error microphone?")
     else:
@@ -351,7 +349,16 @@ def recorded_signals(
         d = channel_disturbances(x, p, None, fs, K)
     if not np.any(d):
         raise ValueError("disturbance must not be silent: every value is 0")
+    if feedback:
+        x = np.concatenate((x, predictor_reference(d)))
     return (x[0], d[0], s[0, 0]) if (K, J, len(x)) == (1, 1, 1) else (x, d, s)
+
+
+def _require_each_microphone(signals: np.ndarray, name: str, n_microphones: int) -> None:
+    if len(signals) != n_microphones:
+        raise ValueError(
+            f"{name} must have a channel for each of the {n_microphones} microphones of secondary, got {len(signals)}"
+        )
 
 
 def _recording(value: Any, name: str, fs: float, length: int | None = None) -> np.ndarray:
@@ -408,7 +415,7 @@ def _settled_loop(run: SimulationResult, s: np.ndarray, uncertainty: Any) -> Fee
     if run.diverged_at_s is not None or run.weights is None:
         return None
     stated: Any = as_uncertainty(uncertainty)
-    measured = [s, *np.reshape(stated, (-1, np.shape(stated)[-1]))] if np.ndim(stated) > 1 else [s]
+    measured = [s, *np.reshape(stated, (-1, *s.shape[:-1], np.shape(stated)[-1]))] if np.ndim(stated) > 1 else [s]
     loops = [internal_model_margin(run.weights[-1], path, s, fs=run.fs) for path in measured]
     least = min(loops, key=lambda loop: loop.disk_margin)
     if not least.stable:
@@ -426,7 +433,7 @@ def _on_uncertain_path(loop: FeedbackMargin | None, s: np.ndarray, uncertainty: 
     if loop is None or np.ndim(stated) > 1:
         return []
     error = path_uncertainty(uncertainty, s)
-    frequencies = np.linspace(0.0, 1.0 / (2.0 * loop.loop.dt), error.size)
+    frequencies = np.linspace(0.0, loop.fs / 2.0, error.size)
     tolerated = loop.path_error_at(frequencies)
     worst = int(np.argmax(error / tolerated))
     if error[worst] < tolerated[worst]:

@@ -181,7 +181,7 @@ class Assessment:
     feedback : bool
         Whether there is no reference microphone.
     loop : FeedbackMargin or None
-        Stability of the settled loop of a feedback controller of one channel; None otherwise, or if the run diverged.
+        Stability of the settled loop of a feedback or hybrid controller; None otherwise, or if the run diverged.
     origin : dict of str to str
         What the page says of where it comes from: the command, and each file.
     """
@@ -316,7 +316,7 @@ class Assessment:
             }
             | ({"channels": dict(zip(counts, self.channels, strict=True))} if self.channels else {})
             | (
-                {"loop": {name: value for name, value in vars(self.loop).items() if name != "loop"}}
+                {"loop": {name: value for name, value in vars(self.loop).items() if name not in ("paths", "fs")}}
                 if self.loop
                 else {}
             ),

@@ -213,18 +213,14 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, 
 
     if options.secondary is None:
         raise ValueError("--secondary is needed: the impulse response from control signal to error microphone")
-    feedback = getattr(options, "feedback", False)
-    if feedback and not (options.primary is None and options.disturbance is None):
-        raise ValueError(
-            f"--feedback takes neither --primary nor --disturbance: {options.noise} is the recording of the error microphone"
-        )
-    if options.primary is None and options.disturbance is None and not feedback:
+    only_errors = options.primary is None and options.disturbance is None
+    if only_errors and not getattr(options, "feedback", False):
         raise ValueError("--primary or --disturbance is needed: what arrives at the error microphone?")
     noise, primary, disturbance = files.channels(options.noise), None, None
     if options.primary is not None:
         primary = files.noise_paths(options.primary, "--primary", noise)
     secondary = files.noise_paths(options.secondary, "--secondary", noise)
-    if feedback and len(noise) != len(secondary):
+    if only_errors and len(noise) != len(secondary):
         raise ValueError(
             f"{options.noise} must have a channel for each of the {len(secondary)} microphone(s) of --secondary, got "
             f"{len(noise)}: choose one, as in {options.noise}:0"

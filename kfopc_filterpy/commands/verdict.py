@@ -18,6 +18,7 @@ EXAMPLES = """examples:
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --fs 16000 --rated-power 1.6 --taps 256
   kfopc verdict stereo.wav:0 --disturbance stereo.wav:1 --secondary paths.mat:S --rated-power 1.6
   kfopc verdict ear.wav --feedback --secondary S.wav --watt 0.1 --ohm 32 --volts-per-unit 1.8
+  kfopc verdict outside.wav --disturbance ear.wav --feedback --secondary S.wav --watt 0.1 --ohm 32 --volts-per-unit 1.8
   cat noise.wav | kfopc verdict - --primary P.wav --secondary S.wav --rated-power 1.6
   kfopc verdict noise.wav --disturbance errors.wav --secondary S1.wav --secondary S2.wav --watt 20 --watt 10 --ohm 8
 
@@ -36,7 +37,10 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     """Add the subcommand."""
     parser = add_command(commands, "verdict", verdict, "say whether an amplifier is enough, and what limits", EXAMPLES)
     add_recorded_scene(parser)
-    about = "no reference microphone, as in headphones: the noise is what the error microphone records without control"
+    about = (
+        "predict the disturbance from its past, too (hybrid control). Without --primary and --disturbance there is no "
+        "reference microphone, as in headphones: the noise is what the error microphone records without control"
+    )
     parser.add_argument("--feedback", action="store_true", help=about)
     add_number(parser, "--want-db", "dB", as_nonnegative, default=6.0, help="noise reduction wanted (default: 6)")
     about = "algorithm of the verdict, behind a limiter: KF-PB (default), KF-OPC or FxLMS; the others run beside it"

@@ -10,11 +10,14 @@ import jsonschema
 import numpy as np
 import pytest
 import soundfile
+from scipy.signal import lfilter
 
 from kfopc_filterpy import noise_reduction_db
 from kfopc_filterpy.bench import assess
 from kfopc_filterpy.bench.assessment import SCHEMA
+from kfopc_filterpy.bounds import predictor_reference
 from kfopc_filterpy.metrics import overshoot
+from kfopc_filterpy.paths import internal_model_margin
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
 from kfopc_filterpy.signals import band_limited_noise
 
@@ -87,6 +90,35 @@ def test_the_order_of_the_loudspeakers_is_that_of_their_powers():
     np.testing.assert_allclose(swapped.required_rated_power, verdict.required_rated_power[::-1], rtol=1e-3)
     assert verdict.unlimited_power[0] != pytest.approx(verdict.unlimited_power[1], rel=0.1)
     np.testing.assert_allclose(swapped.unlimited_power, verdict.unlimited_power[::-1], rtol=1e-3)
+
+
+@pytest.mark.parametrize("n_microphones", [1, 2])
+@pytest.mark.parametrize("heard_before", [True, False])
+def test_feedback_is_a_reference_that_is_the_disturbance_a_sample_late(n_microphones, heard_before):
+    """With an exact path, a white source, and coloured noise that no reference microphone hears."""
+    rng, secondary = np.random.default_rng(6), APART[:n_microphones, :n_microphones]
+    white, unheard = rng.standard_normal(24000), rng.standard_normal((n_microphones, 24000))
+    d = lfilter([0.2], [1.0, -0.98], unheard) + 0.3 * np.roll(white, 20)
+    d[:, -1] = 0.0  # so that d and d(n - 1) both have no offset, which would be subtracted
+    d[:, :-1] -= d[:, :-1].mean(axis=1, keepdims=True)
+    x, late = white - white.mean() if heard_before else None, predictor_reference(d)
+    options = {"primary": None, "secondary": secondary, "rating": 0.1, "want_db": 1.0}
+    feedback = on(x=d if x is None else x, feedback=True, disturbance=None if x is None else d, **options)
+    forward = on(x=late if x is None else np.concatenate((x[np.newaxis], late)), disturbance=d, **options)
+    for one in (feedback.ceilings, forward.ceilings):
+        assert one.power_db < one.filter_db
+    assert feedback.ceilings.filter_db == pytest.approx(forward.ceilings.filter_db, abs=1e-6)
+    assert feedback.bound_db == pytest.approx(forward.bound_db, abs=1e-6)
+    assert feedback.noise_reduction_db == pytest.approx(forward.noise_reduction_db, abs=1e-6)  # d^ is d to rounding
+    np.testing.assert_allclose(feedback.least_rated_power, forward.least_rated_power, rtol=1e-6)
+    assert feedback.ceilings.coherence_db is None
+    several = heard_before or n_microphones > 1
+    assert feedback.channels == ((int(heard_before), n_microphones, n_microphones) if several else None)
+    weights = feedback.runs["KF-PB"].weights[-1]
+    margin = internal_model_margin(weights, secondary if several else secondary[0, 0], fs=FS)
+    assert feedback.loop == margin
+    assert forward.loop is None
+    assert margin.stable
 
 
 # ---- Each cause from both sides
