@@ -63,12 +63,6 @@ def checked_controller(controller: Any) -> Any:
     return controller
 
 
-def require_own_references(controller: Any, wrapper: str) -> None:
-    """Raise ValueError if an internal model gives a controller references that a wrapper does not know of."""
-    if getattr(controller, "internal_model", False):
-        raise ValueError(f"{wrapper} takes no controller with an internal model: give it the controller without one")
-
-
 def differing_counts(controller: Any, **counts: int) -> Iterator[tuple[str, int]]:
     """Yield the numbers of channels that a controller states, by name, and that differ from these."""
     for name, count in counts.items():
@@ -136,7 +130,7 @@ class WrappedController(BlockProcessing, Checkpointed):
 
     def __init_subclass__(cls) -> None:
         """Refuse a second thread in the steps of every wrapper."""
-        for name in {"control_signal", "update", "listen"} & vars(cls).keys():
+        for name in {"control_signal", "update", "take_error", "listen"} & vars(cls).keys():
             setattr(cls, name, _alone(vars(cls)[name]))
 
     def __init__(self, controller: Controller, what: str) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._validate import as_channels, as_number, as_positive
 from ..power.constraint import DEFAULT_FS
-from .base import Controller, WrappedController, listening, require_own_references
+from .base import Controller, WrappedController, listening
 from .channel_samples import LOUDEST, amplified, amplifier_functions, channel_sample, require_moderate
 from .posterior import DEFAULT_UNCERTAINTY, LEAST_SPREAD, PathObserver, relative_spread
 
@@ -144,7 +144,11 @@ class VerifiedController(WrappedController):
         self, controller: Controller, *, fs: float = DEFAULT_FS, memory_s: float = 20.0, amplifier: Any = None
     ) -> None:
         super().__init__(controller, "with a verified path")
-        require_own_references(controller, "VerifiedController")
+        if getattr(controller, "internal_model", False):
+            raise ValueError(
+                "VerifiedController takes no controller with an internal model: its reference is computed with the path "
+                "that is to be verified; give it the controller without one, or state a secondary_path_uncertainty"
+            )
         if hasattr(controller, "physical") or not (
             hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")
         ):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from .._validate import as_channels, as_count, as_real_array, per_channel, requi
 from ..paths.observation import ObservationFilters
 from ..paths.path_matrix import secondary_paths
 from ..power.amplifiers import Amplifiers
-from .base import Controller, WrappedController, differing_counts, listening, require_own_references
+from .base import Controller, WrappedController, differing_counts, listening
 from .channel_samples import ChannelFilters, PlayedSound, require_moderate
 
 if TYPE_CHECKING:
@@ -213,7 +213,8 @@ class VirtualMicrophones(WrappedController):
     ----------
     controller : Controller
         Controller for the virtual microphones: it takes errors (K_v,), and its secondary paths are those to the virtual
-        microphones. A controller of your own works too.
+        microphones. With an internal model, its reference is :math:`\hat d_v(n - 1)`: the headrest without a
+        reference microphone. A controller of your own works too.
     secondary_path : array_like, shape (K, J, taps), or nested sequence of control systems
         Estimated secondary paths to all microphones of the plant, physical and virtual.
     observer : ObservationFilters, array_like of shape (K_v, K_p, n_taps), KalmanObserver, or an object like it
@@ -279,7 +280,6 @@ class VirtualMicrophones(WrappedController):
         amplifier: Amplifiers = None,
     ) -> None:
         super().__init__(controller, "with virtual microphones")
-        require_own_references(controller, "VirtualMicrophones")
         secondary, self._path_fs = secondary_paths(secondary_path)
         self.n_microphones, self.n_loudspeakers, _ = secondary.shape
         self.physical = self._indices(physical, "physical")
@@ -355,6 +355,14 @@ class VirtualMicrophones(WrappedController):
 
         `error` is (K,), of all microphones; only the values of the physical ones are used.
         """
+        self._take(error, self.controller.update)
+
+    def take_error(self, error: NumberOrArray) -> None:
+        """Take the errors without adapting to them, in place of `update`; only for a built-in controller."""
+        self._take(error, self.controller.take_error)
+
+    def _take(self, error: Any, step: Callable[[np.ndarray], None]) -> None:
+        """Hand the errors at the virtual microphones to a step of the controller."""
         heard = as_real_array(error, "error").reshape(-1)
         if heard.size != self.n_microphones:
             raise ValueError(
@@ -364,7 +372,7 @@ class VirtualMicrophones(WrappedController):
             raise ValueError(f"error must be finite, but that of microphone {k} is {heard[k]}")
         require_moderate(heard[self.physical], "error", 1e100)
         disturbance, virtual_error = self._estimate(heard)
-        self.controller.update(virtual_error)
+        step(virtual_error)
         self.observer.advance(disturbance)
         self._virtual_error, self._awaits_error = virtual_error, False
 
@@ -380,13 +388,13 @@ class VirtualMicrophones(WrappedController):
         disturbance = heard[self.physical] + anti_noise[self.physical]
         return disturbance, self.observer.estimate(disturbance) - anti_noise[self.virtual]
 
-    def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
+    def listen(self, references: np.ndarray | None, errors: np.ndarray) -> None:
         """Let the controller follow the noise before the control is switched on, while the loudspeakers are silent.
 
         Parameters
         ----------
-        references : ndarray, shape (I, n_samples)
-            References.
+        references : ndarray, shape (I, n_samples), or None
+            References; None for a feedback controller, which has none.
         errors : ndarray, shape (K, n_samples)
             Signals of all microphones; only those of the physical ones are used.
         """
@@ -394,7 +402,7 @@ class VirtualMicrophones(WrappedController):
         if (
             np.ndim(errors) != 2
             or len(errors) != self.n_microphones
-            or np.shape(references)[-1:] != np.shape(errors)[-1:]
+            or (references is not None and np.shape(references)[-1:] != np.shape(errors)[-1:])
         ):
             raise ValueError(
                 f"errors must be (K microphones, n_samples) with K = {self.n_microphones}, as many samples as references, "

@@ -29,7 +29,6 @@ from kfopc_filterpy.controllers import (
     FeedbackNeutralizer,
     RefusedUpdate,
     VerifiedController,
-    VirtualMicrophones,
     with_internal_model,
 )
 from kfopc_filterpy.realtime import Supervisor
@@ -250,10 +249,6 @@ def test_a_refused_error_leaves_the_state_and_one_that_never_comes_counts_as_sil
         (with_internal_model, "has an internal model"),
         (lambda f: with_internal_model(FxLMS(4, PATHS, step_size=MU, n_references=K - 1)), "for each of the 3 error"),
         (lambda f: FeedbackNeutralizer(f, [0.0, 1.0]), "n_references of 0"),
-        (
-            lambda f: VirtualMicrophones(f, np.ones((2, 1, 4)), [[[1.0]]], physical=[0]),
-            "no controller with an internal",
-        ),
         (VerifiedController, "no controller with an internal"),
         (lambda f: Supervisor(f, fs=FS, amplitude_limit=1.0), "must have a reference microphone"),
         (lambda f: FxLMS(4, S, step_size=MU).control_signal(None), "with_internal_model"),

@@ -12,7 +12,9 @@ from filterpy.kalman import KalmanFilter
 from helpers.channels import random_paths, through
 
 from kfopc_filterpy import FxLMS, HardClipAmplifier, kf_pb, noise_reduction_db, simulate
-from kfopc_filterpy.controllers import KalmanObserver, VirtualMicrophones
+from kfopc_filterpy.bounds import predictor_reference
+from kfopc_filterpy.controllers import KalmanObserver, VirtualMicrophones, with_internal_model
+from kfopc_filterpy.controllers.base import WrappedController
 from kfopc_filterpy.paths import ObservationFilters
 
 FS, TAPS, J = 4000.0, 12, 2
@@ -87,6 +89,35 @@ def test_with_exact_filters_it_is_the_controller_that_hears_the_virtual_places(k
     np.testing.assert_allclose(controller.virtual_error, got.error[VIRTUAL, -1], atol=1e-9)
     assert noise_reduction_db(want.error, want.disturbance) > 1.0  # it did something
     assert got.algorithm == f"{there.name} with virtual microphones"
+
+
+@pytest.mark.parametrize("switch_on_s", [0.0, 50 / FS], ids=["at once", "after listening"])
+@pytest.mark.parametrize("n_references", [0, 1], ids=["feedback", "hybrid"])
+def test_with_an_internal_model_the_noise_at_the_virtual_places_is_the_reference(
+    n_references: int, switch_on_s: float
+) -> None:
+    """Feedforward control with what the observation filters make of d_p, a sample late; a pause at each fifth sample."""
+
+    class Pausing(WrappedController):
+        n = 0
+
+        def control_signal(self, reference: Any) -> Any:
+            return self.controller.control_signal(reference)
+
+        def update(self, error: Any) -> None:
+            self.n += 1
+            (self.controller.update if self.n % 5 else self.controller.take_error)(error)
+
+    d = through(primary(), noise())
+    at_virtual = through(OBSERVATION, d[PHYSICAL])
+    x = noise()[:n_references]
+    fed_back, forward = (inner(n_references=n_references + len(VIRTUAL)) for _ in range(2))
+    options: Any = {"disturbance": d, "secondary_path": SECONDARY, "fs": FS, "switch_on_s": switch_on_s}
+    got = simulate(Pausing(made(controller=with_internal_model(fed_back)), ""), x if n_references else None, **options)
+    reference = np.concatenate((x, predictor_reference(at_virtual)))
+    want = simulate(Pausing(made(controller=forward), ""), reference, **options)
+    np.testing.assert_allclose(got.error, want.error, rtol=0, atol=1e-9)
+    assert np.abs(want.control_signal).max() > 0.01
 
 
 def test_listening_leaves_the_users_amplifier_alone() -> None:
