@@ -60,7 +60,8 @@ class Plan:
     def run(self, name: str, *, limited: bool, share: float = 1.0) -> SimulationResult:
         """Run an algorithm, behind a limiter or not, with a share of the rating's power."""
         limits = scaled(self.limits, share)
-        controller, heard = self.controller(name, limits, limited), self.x
+        controller = self.controller(name, limits, limited)
+        heard: Any = self.x
         if self.feedback:
             controller = with_internal_model(controller)
             heard = np.atleast_2d(self.x)[: controller.n_references] if controller.n_references else None

@@ -102,7 +102,7 @@ def process_steps(
 ) -> np.ndarray:
     """Do what `BlockProcessing.process` says for any controller, by its two methods per sample."""
     e, none = block_signal(errors, "errors"), takes_none(controller, references)
-    x = np.empty((0, e.shape[-1])) if none else block_signal(references, "references")
+    x = np.empty((0, e.shape[-1])) if none or references is None else block_signal(references, "references")
     require_one_length(x, e)
     flags = adapt_flags(adapt, x.shape[-1])
     require_apart(out, x, e)

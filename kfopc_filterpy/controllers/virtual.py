@@ -398,15 +398,11 @@ class VirtualMicrophones(WrappedController):
         errors : ndarray, shape (K, n_samples)
             Signals of all microphones; only those of the physical ones are used.
         """
-        controller = listening(self.controller)
-        if (
-            np.ndim(errors) != 2
-            or len(errors) != self.n_microphones
-            or (references is not None and np.shape(references)[-1:] != np.shape(errors)[-1:])
-        ):
+        controller, given = listening(self.controller), np.asarray(errors if references is None else references)
+        if np.ndim(errors) != 2 or len(errors) != self.n_microphones or given.shape[-1:] != np.shape(errors)[-1:]:
             raise ValueError(
                 f"errors must be (K microphones, n_samples) with K = {self.n_microphones}, as many samples as references, "
-                f"got {np.shape(errors)} and {np.shape(references)}"
+                f"got {np.shape(errors)} and {given.shape}"
             )
         heard: np.ndarray = np.zeros(
             np.shape(errors)

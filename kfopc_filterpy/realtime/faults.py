@@ -36,7 +36,7 @@ class Inspector:
 
     def __call__(self, block: np.ndarray) -> np.ndarray:
         """Return the kind of each sample, (n_channels, n_samples), and replace bad ones in `block`, of that shape."""
-        return np.array([self._inspect(channel, samples) for channel, samples in enumerate(block)])
+        return np.array([self._inspect(channel, samples) for channel, samples in enumerate(block)]).reshape(block.shape)
 
     def _inspect(self, channel: int, samples: np.ndarray) -> np.ndarray:
         """Return the kind of each sample of one channel, and replace bad ones in place.

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .._types import ChangingPaths, Seed
 from .._validate import as_channels, as_choice, as_count, as_positive
-from ..loop.inputs import SensorNoise, channel_disturbances
+from ..loop.inputs import SensorNoise, channel_disturbances, require_one_source
 from ..loop.schedule import Schedule, path_schedule, steps
 from ..paths.path_matrix import is_path_matrix, path_matrix, secondary_paths
 from ..power.amplifiers import Amplifiers, amplifier_of_each
@@ -78,8 +78,8 @@ class SimulatedInterface:
 
     Parameters
     ----------
-    reference : array_like, shape (n_samples,) or (I, n_samples)
-        Reference x, the noise.
+    reference : array_like, shape (n_samples,) or (I, n_samples), or None
+        Reference x, the noise; None without a reference microphone, then give a `disturbance`.
     secondary_path : array_like or control.TransferFunction
         True secondary path s, or paths (K, J, n_taps), without the delay of the interface.
     primary_path : array_like or control.TransferFunction, optional
@@ -117,7 +117,7 @@ class SimulatedInterface:
     ------
     TypeError, ValueError
         Signals or paths that do not fit each other; a latency below a block; both or neither of `primary_path` and
-        `disturbance`.
+        `disturbance`, or a primary path without a reference.
 
     Examples
     --------
@@ -135,7 +135,7 @@ class SimulatedInterface:
 
     def __init__(
         self,
-        reference: ArrayLike,
+        reference: ArrayLike | None,
         secondary_path: ChangingPaths,
         *,
         primary_path: ChangingPaths | None = None,
@@ -157,7 +157,13 @@ class SimulatedInterface:
             raise ValueError(f"latency must be at least a block, {self.block} samples, got {self.latency}")
         self.clock = as_choice(clock, "clock", ("free", "real"))
         self._sensor_noise = SensorNoise(sensor_noise_std, rng)
-        self._x = np.atleast_2d(as_channels(reference, "reference"))
+        require_one_source(primary_path, disturbance)
+        if reference is None and disturbance is None:
+            raise ValueError("without a reference give disturbance=, what the error microphones hear")
+        if reference is None:
+            self._x = np.empty((0, np.shape(disturbance)[-1]))
+        else:
+            self._x = np.atleast_2d(as_channels(reference, "reference"))
         self.n_references = len(self._x)
 
         def schedule(paths: Any, name: str, read: Callable[[Any], np.ndarray]) -> Schedule:
@@ -168,8 +174,6 @@ class SimulatedInterface:
         total = np.pad(secondary.values[0], ((0, 0), (0, 0), (self.latency, 0)))
         several = any(is_path_matrix(path) for _, path in steps(secondary_path, "secondary_path"))
         self.total_secondary_path = total if several else total[0, 0]
-        if (primary_path is None) == (disturbance is None):
-            raise ValueError("give exactly one of primary_path= and disturbance=")
         self.disturbance = channel_disturbances(
             self._x, primary_path, disturbance, self.fs, self.n_microphones, crossfade_s
         )

@@ -16,6 +16,7 @@ import numpy as np
 from .._types import PerLoudspeaker, Seed
 from .._validate import as_count, as_generator, as_nonnegative, as_positive, per_loudspeaker
 from ..bounds.power_constrained import power_constrained_wiener
+from ..bounds.prediction import predictor_reference
 from ..bounds.settings import SuggestedSettings, suggest_settings
 from ..controllers.base import Controller, listed
 from ..paths.identification import PathEstimate, estimate_path
@@ -153,7 +154,8 @@ class IdentifiedPlant:
     round_trip_samples : int
         Samples from a control signal to its first arrival at an error microphone.
     references, errors : ndarray, shape (n_samples,), or (I, n_samples) and (K, n_samples)
-        Microphones during the silence before; with one channel, without a channel axis.
+        Microphones during the silence before; with one channel, without a channel axis. Without a reference microphone,
+        `references` is (0, n_samples).
     fs : float
         Sample rate in Hz.
     """
@@ -175,8 +177,12 @@ class IdentifiedPlant:
         return np.asarray(self.path.uncertainty)
 
     def suggested(self, n_taps: int | None = None) -> SuggestedSettings:
-        """Return `suggest_settings` for the noise heard in the silence, for `n_taps` taps or a length found; one channel."""
-        return suggest_settings(self.references, self.errors, self.taps, fs=self.fs, n_taps=n_taps)
+        """Return `suggest_settings` for the noise heard in the silence, for `n_taps` taps or a length found; one channel.
+
+        Without a reference microphone, they are those of a feedback controller.
+        """
+        x = self.references if self.references.size else predictor_reference(self.errors)
+        return suggest_settings(x, self.errors, self.taps, fs=self.fs, n_taps=n_taps)
 
 
 @dataclass
@@ -238,8 +244,7 @@ class _Session:
         if block is None:
             return None
         began = time.perf_counter()
-        x, e = (signals if supervisor.multichannel else signals[0] for signals in (block.references, block.errors))
-        y = np.atleast_2d(supervisor.process(x, e, lost=block.lost))
+        y = np.atleast_2d(supervisor.process(block.references, block.errors, lost=block.lost))
         self.interface.write(y)
         if self.underflows > self._noted:
             supervisor.note("output underflow", (self.underflows - self._noted) * y.shape[1])
@@ -485,7 +490,7 @@ def _open(interface: Interface) -> Iterator[None]:
 def _warm_up(supervisor: Supervisor, block: int) -> None:
     """Process blocks with a copy of the controller, so that all that it uses is loaded before the first real one."""
     rng, shapes = np.random.default_rng(0), ((supervisor.n_references, block), (supervisor.n_microphones, block))
-    signals = [1e-3 * rng.standard_normal(shape if supervisor.multichannel else block) for shape in shapes]
+    signals = [1e-3 * rng.standard_normal(shape) for shape in shapes]
     for _ in range(2 * max(WARM_UP // block, 1)):
         supervisor.process(*signals)
     supervisor.start_silent()
@@ -644,9 +649,9 @@ def _identified(
     if taps <= round_trip:
         raise ValueError(f"n_path must exceed the round trip, {round_trip} samples, got {n_path}")
     left = [-_without_noise(r.y[j : j + 1], r.x, r.e, taps, fs) for j, r in enumerate(recordings)]  # e = d - s * y
-    if interface.n_loudspeakers == interface.n_microphones == interface.n_references == 1:
+    if interface.n_loudspeakers == interface.n_microphones == 1 >= interface.n_references:
         path = estimate_path(recordings[0].y[0], left[0][0], taps, fs)
-        return IdentifiedPlant(path, round_trip, silence.x[0], silence.e[0], fs)
+        return IdentifiedPlant(path, round_trip, silence.x[0] if len(silence.x) else silence.x, silence.e[0], fs)
     length = min(e.shape[1] for e in left)
     sent = np.array([r.y[j, :length] for j, r in enumerate(recordings)])
     path = estimate_path(sent, np.array([e[:, :length] for e in left]), taps, fs)
@@ -679,35 +684,38 @@ def _require_fit(supervisor: Supervisor, interface: Interface) -> None:
 def _possible_db(silence: _Heard, controller: Any, fs: float) -> float:
     """Return the noise reduction of the best filter; raise `NotCausalError` if only a faster plant would allow any."""
     path, n_taps = getattr(controller, "secondary_path", None), getattr(controller, "n_taps", None)
-    if path is None or n_taps is None or not np.any(silence.e) or not np.any(silence.x):
+    x, d = silence.x, silence.e
+    if getattr(controller, "internal_model", False):
+        x = np.concatenate((x, predictor_reference(d)))
+    if path is None or n_taps is None or not np.any(d) or not np.any(x):
         return np.nan
-    if silence.x.shape[1] < 4 * (n_taps + np.shape(path)[-1]):
+    if x.shape[1] < 4 * (n_taps + np.shape(path)[-1]):
         return np.nan
-    possible = _best_db(silence, path, n_taps, fs)
+    possible = _best_db(x, d, path, n_taps, fs)
     if possible >= WORTH_DB:
         return possible
     taps = np.abs(np.reshape(path, (-1, np.shape(path)[-1])))
     delay = int(np.argmax(np.any(taps > DELAY_SHARE * np.max(taps), axis=0)))  # until the first path has arrived
-    sooner = _best_db(silence, path[..., delay:], n_taps + delay, fs)
+    sooner = _best_db(x, d, path[..., delay:], n_taps + delay, fs)
     if sooner < possible + WORTH_DB:
         return possible
     raise NotCausalError(
         f"the anti-noise comes too late: it takes {delay} samples ({1e3 * delay / fs:.1f} ms) to reach the error "
         f"microphone, and no filter of {n_taps} taps reduces the noise by more than {possible:.1f} dB (without this delay "
-        f"{sooner:.1f} dB). Use shorter blocks, or move the reference microphone towards the noise: each millisecond "
+        f"{sooner:.1f} dB). Use shorter blocks, or place a reference microphone nearer to the noise: each millisecond "
         "corresponds to 34 cm. To run anyway, set check_causality=False"
     )
 
 
-def _best_db(silence: _Heard, path: Any, n_taps: int, fs: float) -> float:
+def _best_db(x: np.ndarray, d: np.ndarray, path: Any, n_taps: int, fs: float) -> float:
     """Return the noise reduction of the best filter of some taps, whatever its power."""
     import warnings
 
-    single = np.ndim(path) == 1
-    x, d = (signal[0] if single else signal for signal in (silence.x, silence.e))
+    if np.ndim(path) == 1:
+        x, d = x[0], d[0]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", np.exceptions.RankWarning)  # a lower bound does here
         solution = power_constrained_wiener(
-            x, d, path, n_taps, LOUDEST * float(np.mean(silence.x**2)), fs=fs, segment_s=d.shape[-1] / fs
+            x, d, path, n_taps, LOUDEST * float(np.mean(x**2)), fs=fs, segment_s=d.shape[-1] / fs
         )
     return float(np.max(solution.unconstrained.noise_reduction_db))

@@ -22,7 +22,7 @@ class SoundDevice:
     Parameters
     ----------
     reference_channels, error_channels : sequence of int
-        Inputs of the reference and the error microphones, the first input is 0.
+        Inputs of the reference and the error microphones, the first input is 0. Without a reference microphone ``[]``.
     output_channels : sequence of int, default (0,)
         Outputs of the loudspeakers. The other outputs up to the largest of them stay silent.
     fs : float, default 16000
@@ -52,8 +52,8 @@ class SoundDevice:
     ImportError
         sounddevice or the PortAudio library is missing.
     ValueError
-        No channels, a negative one, or one that is both a reference and an error; at the start, a card that cannot be
-        opened.
+        No error microphone or loudspeaker, a negative channel, or one that is both a reference and an error; at the
+        start, a card that cannot be opened.
 
     Examples
     --------
@@ -77,7 +77,7 @@ class SoundDevice:
         latency: float | str = "low",
         ahead: int = 2,
     ) -> None:
-        self._references = _indices(reference_channels, "reference_channels")
+        self._references = _indices(reference_channels, "reference_channels") if len(reference_channels) else []
         self._errors = _indices(error_channels, "error_channels")
         self._outputs = _indices(output_channels, "output_channels")
         if set(self._references) & set(self._errors):

@@ -45,12 +45,17 @@ class Supervisor(Checkpointed):
 
     A bad sample of a reference also spoils the filtered reference for as long as the control filter and the secondary
     path remember it. The controller therefore adapts again `recovery_samples` after the last bad reference. After a bad
-    error, it adapts to the next sample.
+    error, it adapts to the next sample, unless an internal model makes a reference of the error.
+
+    An internal model needs to know what was really played. So a controller with one gets the errors that it would hear if
+    its own control signals were played as they are, without fades and limits, and in place of a bad error the
+    one that says that there is no noise.
 
     Parameters
     ----------
     controller : Controller
-        Any controller that can be copied. A fresh copy of its present state replaces it after a divergence.
+        Any controller that can be copied. A fresh copy of its present state replaces it after a divergence. A feedback
+        controller (`controllers.with_internal_model`) has no references: its blocks are ``process(None, errors)``.
     fs : float, default 16000
         Sample rate in Hz.
     amplitude_limit : float or array_like, shape (J,)
@@ -95,7 +100,8 @@ class Supervisor(Checkpointed):
     Raises
     ------
     TypeError, ValueError
-        An object that is not a controller; a limit, time or choice that is out of range.
+        An object that is not a controller; a limit, time or choice that is out of range; virtual microphones around
+        a controller with an internal model.
 
     Notes
     -----
@@ -106,7 +112,8 @@ class Supervisor(Checkpointed):
       limit for a tenth of the time, from a control filter whose gain has grown;
     - updates that the controller refuses for a tenth of the samples;
     - squared innovations 40 dB above what is usual or predicted, if the reference has not risen as much, for the
-      controllers around a Kalman filter (of the last sample of each block).
+      controllers around a Kalman filter (of the last sample of each block). The disturbances of an internal model
+      count as references.
 
     `save` and `load` include the controller, its copies, the fades and pauses under way, and the health record. Call
     `save` between two blocks.
@@ -147,10 +154,11 @@ class Supervisor(Checkpointed):
         blocks_can_repeat: bool = True,
     ) -> None:
         self._controller: Any = checked_controller(controller)
-        if getattr(controller, "n_references", 1) == 0:
+        self._modelled = bool(getattr(controller, "internal_model", False))
+        if self._modelled and hasattr(controller, "physical"):
             raise ValueError(
-                "controller must have a reference microphone: a feedback controller without one runs by its own "
-                "process(None, errors), without a supervisor"
+                "controller must not have virtual microphones and an internal model: its paths are not those to the error "
+                "microphones; let it run by its own process, without a supervisor"
             )
         self.fs = as_positive(fs, "fs", unit="Hz")
         if hasattr(controller, "require_sample_rate"):
@@ -158,7 +166,7 @@ class Supervisor(Checkpointed):
         self.multichannel = bool(getattr(controller, "multichannel", False))
         counts = ("n_references", "n_microphones", "n_loudspeakers")
         self.n_references, self.n_microphones, self.n_loudspeakers = (
-            int(getattr(controller, count, 1)) if self.multichannel else 1 for count in counts
+            int(getattr(controller, count, 1)) for count in counts
         )
         self.amplitude_limit = per_loudspeaker(amplitude_limit, self.n_loudspeakers, "amplitude_limit")
         self.on_divergence = as_choice(on_divergence, "on_divergence", ACTIONS)
@@ -189,7 +197,11 @@ class Supervisor(Checkpointed):
         self._unusable = 0  # samples since the last usable one
         self._paused_for_input = False
         self._last_y = np.zeros(self.n_loudspeakers)
-        self._last_blocks: tuple[Any, Any] = (None, None)
+        self._last_block: Any = None
+        # The last samples that the controller wanted to play, and those that were played, as far as an internal model
+        # remembers them.
+        remembered = np.shape(controller.secondary_path)[-1] - 1 if self._modelled else 0
+        self._wanted_y, self._played_y = np.zeros((2, self.n_loudspeakers, remembered))
         self._usual, self._usual_reference, self._normal_gain = np.nan, np.nan, np.inf
         self._windows, self._loud_windows = 0, 0
         self._begin_window()
@@ -215,6 +227,7 @@ class Supervisor(Checkpointed):
         if _limiters(self.controller) and isinstance(other, CoreController | WrappedController):
             other.limiter = self.controller.limiter
         self.controller = other
+        self._wanted_y[:] = 0.0
 
     @property
     def _target(self) -> float:
@@ -261,7 +274,8 @@ class Supervisor(Checkpointed):
         Parameters
         ----------
         references : array_like, shape (n_samples,) or (I, n_samples), or None
-            References x; None, and any value that is None, NaN or infinite, is a missing sample.
+            References x; None, and any value that is None, NaN or infinite, is a missing sample. Always None for a
+            controller without a reference microphone.
         errors : array_like, shape (n_samples,) or (K, n_samples), or None
             Errors e, of as many samples; None as for the references, but not for both.
         lost : int, default 0
@@ -286,11 +300,17 @@ class Supervisor(Checkpointed):
             self._note("lost", n_samples=lost)
             self._samples += lost
             self._since_bad_reference = 0
-        usable = self._usable(x, e)
-        y = self._control(x, e, usable)
+        bad_errors, usable = self._usable(x, e)
+        e, d = self._as_wanted(e, bad_errors) if self._modelled else (e, e[:0])
+        wanted, y = self._control(x, e, usable)
         self._limit(y)
+        if self._modelled:
+            self._wanted_y, self._played_y = (
+                np.concatenate((before, now), axis=1)[:, now.shape[1] :]
+                for before, now in ((self._wanted_y, wanted), (self._played_y, y))
+            )
         self._samples += y.shape[1]
-        self._watch(x, y)
+        self._watch(np.concatenate((x, d)), y)
         return y if self.multichannel else y[0]
 
     # ---- What comes in
@@ -311,20 +331,40 @@ class Supervisor(Checkpointed):
             np.full((self.n_microphones, n), np.nan) if e is None else e,
         )
 
-    def _usable(self, x: np.ndarray, e: np.ndarray) -> np.ndarray:
-        """Return which samples can be learned from, (n,); bad ones are replaced in place and noted."""
-        repeated = self.blocks_can_repeat and all(map(is_repeated, (x, e), self._last_blocks))
-        self._last_blocks = (x.copy(), e.copy())
+    def _usable(self, x: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return which errors are bad, (K, n), and which samples can be learned from, (n,); bad ones are replaced and noted."""
+        block = np.concatenate((x, e))
+        repeated = self.blocks_can_repeat and is_repeated(block, self._last_block)
+        self._last_block = block
         kinds = [inspector(block) for inspector, block in zip(self._inspectors, (x, e), strict=True)]
         for name, kind in zip(("reference", "error"), kinds, strict=True):
             if repeated:
                 kind[kind == GOOD] = REPEATED
             self._note_kinds(name, kind)
         bad_x, bad_e = (np.any(kind != GOOD, axis=0) for kind in kinds)
+        if self._modelled:
+            bad_x = bad_x | bad_e
         since, self._since_bad_reference = _samples_since(bad_x, self._since_bad_reference)
         usable = ~bad_x & ~bad_e & (since >= self.recovery_samples)
         self._count_unusable(usable)
-        return usable
+        return kinds[1] != GOOD, usable
+
+    def _as_wanted(self, e: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the errors (K, n) if all that the controller wanted had been played, and the disturbances.
+
+        The sound of this block is not in it yet: an estimated path begins with at least a block of zeros. Where an
+        error is bad, the disturbance is zero.
+        """
+        path = np.reshape(self.controller.secondary_path, (self.n_microphones, self.n_loudspeakers, -1))
+
+        def heard(signals: np.ndarray) -> np.ndarray:
+            lines = np.pad(signals, ((0, 0), (0, e.shape[1])))
+            rows = np.lib.stride_tricks.sliding_window_view(lines, path.shape[2], axis=1)[..., ::-1]
+            return np.tensordot(path, rows, axes=((1, 2), (0, 2)))
+
+        wanted = heard(self._wanted_y)
+        errors = np.where(bad, -wanted, e + heard(self._played_y - self._wanted_y))
+        return errors, errors + wanted
 
     def _note_kinds(self, name: str, kinds: np.ndarray) -> None:
         """Record the bad samples of a block."""
@@ -348,22 +388,22 @@ class Supervisor(Checkpointed):
 
     # ---- The control signal
 
-    def _control(self, x: np.ndarray, e: np.ndarray, usable: np.ndarray) -> np.ndarray:
-        """Return the control signals of a block, (J, n), faded."""
+    def _control(self, x: np.ndarray, e: np.ndarray, usable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the control signals of a block, (J, n), as the controller wants them, and faded."""
         n = x.shape[1]
         gains = self._gains(n)
         # The controller does not know that its output is faded: it must forget that before it adapts.
         since, self._since_fade = _samples_since(gains < 1.0, self._since_fade)
         if not np.any(gains):
             self._listen(x, e, usable)
-            y = np.zeros((self.n_loudspeakers, n))
+            wanted = np.zeros((self.n_loudspeakers, n))
         else:
             frozen = min(self._frozen, n)
             self._frozen -= frozen
             adapt = usable & (since >= self.recovery_samples)
             adapt[:frozen] = False
-            y = self._adapted(x, e, adapt) * gains
-        return self._finite(y)
+            wanted = self._adapted(x, e, adapt)
+        return np.where(np.isfinite(wanted), wanted, 0.0), self._finite(wanted * gains)
 
     def _gains(self, n: int) -> np.ndarray:
         """Return the gains of a block, which approach the target at a constant rate."""
@@ -534,8 +574,10 @@ class Supervisor(Checkpointed):
         begin = (self._samples + after) / self.fs
         self.health.note(what, channel, time_s=begin, n_samples=n_samples, until_s=begin + n_samples / self.fs)
 
-    def _shaped(self, block: np.ndarray) -> np.ndarray:
-        """Return a block as the controller takes it."""
+    def _shaped(self, block: np.ndarray) -> Any:
+        """Return a block as the controller takes it: None for no channels."""
+        if not len(block):
+            return None
         return np.ascontiguousarray(block) if self.multichannel else block[0]
 
 
@@ -544,7 +586,7 @@ def _channels(value: Any, n_channels: int, name: str) -> np.ndarray:
     block = np.array(as_real_array(value, name))
     block = block[np.newaxis] if block.ndim == 1 and n_channels == 1 else block
     if block.ndim != 2 or len(block) != n_channels:
-        wanted = "(n_samples,)" if n_channels == 1 else f"({n_channels}, n_samples)"
+        wanted = {0: "None", 1: "(n_samples,)"}.get(n_channels, f"({n_channels}, n_samples)")
         raise ValueError(f"{name} must be {wanted} for this controller, got shape {block.shape}")
     return np.ascontiguousarray(block)
 

@@ -13,9 +13,11 @@ import pytest
 from scipy.signal import lfilter
 
 from kfopc_filterpy import FxLMS, HardClipAmplifier, simulate
+from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.realtime import (
     Block,
     FaultError,
+    IdentifiedPlant,
     Interface,
     NotCausalError,
     RunStatus,
@@ -133,8 +135,37 @@ def test_several_loudspeakers_and_microphones() -> None:
     assert np.all(report.reduction_db > 6.0)
 
 
+@pytest.mark.parametrize("several", [False, True], ids=["feedback", "hybrid of several channels"])
+def test_a_run_with_an_internal_model(several: bool) -> None:
+    """A tone that no reference microphone hears can be predicted over the two blocks."""
+    tone = np.sin(2 * np.pi * 200 * np.arange(X.size) / FS)
+    n_heard = int(several)
+    paths, d = S, tone + 0.05 * X
+    if several:
+        paths = np.multiply.outer([[0.9, 0.2], [0.1, 0.8]], [0.0, 1.0, 0.0, 0.0])
+        d = np.stack((d, np.roll(d, 5)))
+    interface = Recorded(X[np.newaxis] if several else None, paths, disturbance=d, fs=FS, block=32, latency=64)
+
+    def make(plant: IdentifiedPlant) -> Any:
+        assert np.shape(plant.references)[-1] == np.shape(plant.errors)[-1]
+        return with_internal_model(
+            FxLMS(24, plant.taps, step_size=1e-4, n_references=n_heard + interface.n_microphones)
+        )
+
+    report = run(make, interface, amplitude_limit=8.0, seconds=3.0, listen_s=0.5, identify_s=2.0)
+    assert report.stopped_by == "end"
+    assert report.possible_db > 15.0
+    assert np.all(report.reduction_db > 10.0)
+    assert not report.health.counts
+    assert not np.any(interface.played[-1])
+    unpredictable = Recorded(None, S, disturbance=X, fs=FS, block=32, latency=64)
+    if not several:
+        with pytest.raises(NotCausalError, match="place a reference microphone"):
+            run(make, unpredictable, amplitude_limit=8.0, listen_s=0.5, identify_s=2.0)
+
+
 def test_a_plant_that_is_not_causal_is_refused_with_the_way_out() -> None:
-    with pytest.raises(NotCausalError, match=r"it takes 193 samples .* Use shorter blocks, or move the reference"):
+    with pytest.raises(NotCausalError, match=r"it takes 193 samples .* Use shorter blocks, or place a reference"):
         started(plant(block=64, latency=192))
     tone = np.sin(2 * np.pi * 200 * np.arange(X.size) / FS)  # can be predicted: not refused
     report = started(
@@ -327,8 +358,10 @@ def test_channels_that_do_not_fit_are_refused() -> None:
         run(FxLMS(8, np.ones((2, 1, 70)), step_size=1e-3), plant(), amplitude_limit=1.0, listen_s=0.1)
     with pytest.raises(ValueError, match="latency must be at least a block"):
         plant(latency=31)
-    with pytest.raises(ValueError, match="exactly one of primary_path= and disturbance="):
+    with pytest.raises(ValueError, match="either primary_path= or disturbance="):
         plant(disturbance=X)
+    with pytest.raises(ValueError, match="without a reference give disturbance="):
+        SimulatedInterface(None, S, primary_path=PRIMARY)
     with pytest.raises(ValueError, match="feedback_path must lead"):
         SimulatedInterface(X, np.ones((1, 1, 2)), disturbance=X[np.newaxis], feedback_path=np.zeros((2, 1, 4)))
 
@@ -495,7 +528,7 @@ def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(uninsta
     uninstall("sounddevice")
     with pytest.raises(ImportError, match=r"pip install -e .\.\[realtime\]."):
         device.start()
-    for channels, message in ((([], [1]), "reference_channels must be"), (([0], [0]), "must be different inputs")):
+    for channels, message in ((([0], []), "error_channels must be"), (([0], [0]), "must be different inputs")):
         with pytest.raises(ValueError, match=message):
             SoundDevice(*channels)
     with pytest.raises(ValueError, match="output_channels must be"):

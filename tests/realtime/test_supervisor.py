@@ -13,9 +13,10 @@ import pytest
 from helpers.channels import random_paths
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from kfopc_filterpy import KFOPC, FxLMS, KalmanController, OutputPowerConstraint, kf_anc, kf_opc
-from kfopc_filterpy.controllers import VerifiedController
+from kfopc_filterpy.controllers import VerifiedController, with_internal_model
 from kfopc_filterpy.realtime import Health, SimulatedInterface, Supervisor
 
 FS = 8000.0
@@ -339,6 +340,41 @@ def test_long_faults_fade_out_and_in_again() -> None:
     assert np.any(y[0, 12000] != 0.0)
     assert np.all(np.abs(y[0, 21000:]) <= LIMIT)
     assert np.std(y[0, 21000:]) > 0.1
+
+
+@pytest.mark.parametrize("n_references", [0, 1], ids=["feedback", "hybrid"])
+def test_an_internal_model_knows_of_fades_limits_and_bad_errors(n_references: int) -> None:
+    """With an exact path, what is played is the settled filter's output for x and d(n - 1), faded and limited.
+
+    The filter predicts a tone, so its loop gain is one: where it is not heard, it would oscillate by itself.
+    """
+    n, rng = round(4 * FS), np.random.default_rng(3)
+    d, x = np.sin(0.2 * np.arange(n)) + 0.05 * rng.standard_normal(n), rng.standard_normal((n_references, n))
+    path = PATH[np.newaxis, np.newaxis] if n_references else PATH
+    supervisor = supervised(with_internal_model(FxLMS(24, path, step_size=1e-3, n_references=1 + n_references)))
+    interface = SimulatedInterface(
+        x if n_references else None, path[..., LATENCY:], disturbance=d, fs=FS, block=BLOCK, latency=LATENCY
+    )
+    out, back, spoilt, end = 20000, 22080, 22496, 22688  # the first samples of blocks
+    weights = []
+
+    def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[Any, Any]:
+        if first in (out, back):
+            (supervisor.fade_out if first == out else supervisor.fade_in)()
+            supervisor.amplitude_limit = np.array([1.3])
+        weights.append(supervisor.controller.weights)
+        return (x if n_references else None), (np.full_like(e, np.nan) if spoilt <= first < end else e)
+
+    y, _ = loop(supervisor, interface, spoil)
+    settled = weights[out // BLOCK]
+    np.testing.assert_array_equal(weights[end // BLOCK], settled)  # it never adapts between two faults
+    known = np.where((np.arange(n) >= spoilt) & (np.arange(n) < end), 0.0, d)
+    heard_before = np.concatenate((x, np.roll(known, 1)[np.newaxis]))
+    filtered = sum(lfilter(w, 1.0, one) for w, one in zip(settled.reshape(-1, 24), heard_before, strict=True))
+    fade = np.interp(np.arange(n), [out - 1, out - 1 + 400, back - 1, back - 1 + 400], [1.0, 0.0, 0.0, 1.0])
+    until = end + supervisor.recovery_samples // BLOCK * BLOCK
+    np.testing.assert_allclose(y[0, out:until], np.clip(fade * filtered, -1.3, 1.3)[out:until], rtol=0, atol=1e-9)
+    assert supervisor.health.counts.keys() == {"limited", "not finite"}
 
 
 def test_fades_are_smooth() -> None:
