@@ -30,6 +30,7 @@ WORTH_DB = 1.0  # less noise reduction than this, by any filter, is no control
 WARM_UP = 1024  # samples, so that a controller that works between blocks has done so
 FATAL, FATAL_S = 3, 600.0  # so many divergences within this time end a run
 MOST_PARTS = 2048  # whose energies are kept; then neighbours are joined
+NOISE_TAPS = 64  # of the filter that makes the unexplained noise white
 DELAY_SHARE = 0.05  # of the largest tap, at which a path has arrived
 
 
@@ -650,12 +651,33 @@ def _identified(
         raise ValueError(f"n_path must exceed the round trip, {round_trip} samples, got {n_path}")
     left = [-_without_noise(r.y[j : j + 1], r.x, r.e, taps, fs) for j, r in enumerate(recordings)]  # e = d - s * y
     if interface.n_loudspeakers == interface.n_microphones == 1 >= interface.n_references:
-        path = estimate_path(recordings[0].y[0], left[0][0], taps, fs)
+        path = _fitted(recordings[0].y[0], left[0][0], taps, fs)
         return IdentifiedPlant(path, round_trip, silence.x[0] if len(silence.x) else silence.x, silence.e[0], fs)
     length = min(e.shape[1] for e in left)
     sent = np.array([r.y[j, :length] for j, r in enumerate(recordings)])
-    path = estimate_path(sent, np.array([e[:, :length] for e in left]), taps, fs)
+    path = _fitted(sent, np.array([e[:, :length] for e in left]), taps, fs)
     return IdentifiedPlant(path, round_trip, silence.x, silence.e, fs)
+
+
+def _fitted(sent: np.ndarray, heard: np.ndarray, n_taps: int, fs: float) -> PathEstimate:
+    """Return the path by least squares, weighted by the spectrum of what a first fit has not explained.
+
+    That is the noise that no reference microphone hears. A loud tone, for example, then costs accuracy only at its frequency.
+    """
+    from scipy.linalg import solve_toeplitz
+    from scipy.signal import fftconvolve, lfilter
+
+    first = estimate_path(sent, heard, n_taps, fs)
+    y = np.atleast_2d(sent)[:, np.newaxis]
+    e = heard.reshape(len(y), -1, heard.shape[-1])
+    paths = first.taps.reshape(e.shape[1], e.shape[0], n_taps).swapaxes(0, 1)
+    left = (e - fftconvolve(y, paths, axes=-1)[..., : e.shape[-1]])[..., n_taps - 1 :]
+    powers = np.abs(np.fft.rfft(left, 2 * left.shape[-1])) ** 2
+    correlation = np.fft.irfft(powers.mean(axis=(0, 1)))[: NOISE_TAPS + 1]
+    if not correlation[0] > 0.0:
+        return first
+    whitening = np.append(1.0, -solve_toeplitz(correlation[:-1], correlation[1:]))
+    return estimate_path(lfilter(whitening, 1.0, sent), lfilter(whitening, 1.0, heard), n_taps, fs)
 
 
 def _without_noise(y: np.ndarray, x: np.ndarray, e: np.ndarray, n_taps: int, fs: float) -> np.ndarray:

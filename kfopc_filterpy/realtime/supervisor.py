@@ -200,7 +200,7 @@ class Supervisor(Checkpointed):
         self._last_block: Any = None
         # The last samples that the controller wanted to play, and those that were played, as far as an internal model
         # remembers them.
-        remembered = np.shape(controller.secondary_path)[-1] - 1 if self._modelled else 0
+        remembered = np.shape(self._controller.secondary_path)[-1] - 1 if self._modelled else 0
         self._wanted_y, self._played_y = np.zeros((2, self.n_loudspeakers, remembered))
         self._usual, self._usual_reference, self._normal_gain = np.nan, np.nan, np.inf
         self._windows, self._loud_windows = 0, 0

@@ -39,6 +39,7 @@ MAKERS: dict[str, Any] = {
         initial_variance=1e-2,
     ),
     "FxLMS of several channels": lambda: FxLMS(16, PATHS, step_size=3e-4),
+    "hybrid FxLMS of several channels": lambda: with_internal_model(FxLMS(16, PATHS, step_size=3e-4, n_references=3)),
     "verified": lambda: VerifiedController(FxLMS(24, PATH, step_size=1e-3), fs=FS),
 }
 
