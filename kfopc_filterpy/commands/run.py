@@ -26,6 +26,7 @@ EXAMPLES = """examples:
   kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --seconds 20
   kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --clock real --block 32
   kfopc run --device 3 --references 0 --errors 1 --outputs 0 --rated-power 0.01 --amplitude-limit 0.5
+  kfopc run --device 3 --errors 1 --feedback --rated-power 0.01 --amplitude-limit 0.5
 
 With a recording, the plant is simulated; give several channels as for kfopc verdict. With --references and --errors, it
 is real, behind a sound card at --fs or 16000 Hz: begin with a small --amplitude-limit.
@@ -38,6 +39,11 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     parser = add_command(commands, "run", run, about, EXAMPLES)
     parser.add_argument("noise", nargs="?", help="recording of the reference microphone, for a simulated plant")
     add_scene(parser, required=False)
+    about = (
+        "predict the disturbance from its past, too (hybrid control). Without --references, or for a recording without "
+        "--primary and --disturbance, there is no reference microphone: the recording is that of the error microphone"
+    )
+    parser.add_argument("--feedback", action="store_true", help=about)
     about = "simulate as fast as possible, or in real time"
     parser.add_argument("--clock", choices=("free", "real"), default="free", help=about)
     add_count(parser, "--latency", help="samples from writing to playing (default: two blocks)")
@@ -92,10 +98,11 @@ def run(options: argparse.Namespace) -> int:
 def _sound_card(options: argparse.Namespace) -> Interface:
     from ..realtime import SoundDevice
 
-    if options.references is None or options.errors is None:
+    references = [] if options.references is None and options.feedback else options.references
+    if references is None or options.errors is None:
         raise ValueError(
             "a recording with --primary and --secondary is needed for a simulated plant, or --references and --errors, "
-            "the inputs of a sound card"
+            "the inputs of a sound card; without a reference microphone, --feedback in place of --references"
         )
     of_files = ("primary", "disturbance", "secondary", "microphones", "file_fs", "channel", "variable")
     unused = [f"--{name.replace('_', '-')}" for name in of_files if getattr(options, name) is not None]
@@ -103,10 +110,10 @@ def _sound_card(options: argparse.Namespace) -> Interface:
         raise ValueError(
             f"{' and '.join(unused)} would not be used with a sound card: leave it out, or give a recording"
         )
-    if set(options.references) & set(options.errors):
+    if set(references) & set(options.errors):
         raise ValueError("--references and --errors must be different inputs of the sound card")
     return SoundDevice(
-        options.references,
+        references,
         options.errors,
         options.outputs,
         fs=options.fs or 16000.0,
@@ -129,6 +136,8 @@ def _simulated(options: argparse.Namespace) -> SimulatedInterface:
     files = Files(options)
     noise, primary, secondary, disturbance = scene_of(options, files)
     _judge_length(options, noise.shape[-1] / files.fs)
+    if primary is None and disturbance is None:
+        noise, disturbance = None, noise
     return SimulatedInterface(
         noise,
         secondary,
@@ -156,21 +165,24 @@ def _judge_length(options: argparse.Namespace, lasts: float) -> None:
 
 
 def _controller(plant: Any, options: argparse.Namespace, limit: float) -> Any:
-    """Return KF-PB behind a limiter, for the plant that was identified."""
+    """Return KF-PB behind a limiter, for the plant that was identified; with feedback around an internal model."""
     from .. import OutputLimiter, kf_pb
+    from ..controllers import with_internal_model
 
-    several = np.ndim(plant.taps) == 3
-    n_loudspeakers = plant.taps.shape[1] if several else 1
+    n_loudspeakers = plant.taps.shape[1] if np.ndim(plant.taps) == 3 else 1
+    n_references = len(np.atleast_2d(plant.references)) + options.feedback * len(np.atleast_2d(plant.errors))
+    several = np.ndim(plant.taps) == 3 or n_references > 1
     limiters = [OutputLimiter(options.rated_power, fs=plant.fs, amplitude_limit=limit) for _ in range(n_loudspeakers)]
-    return kf_pb(
+    controller = kf_pb(
         options.taps,
         plant.taps,
         rated_power=options.rated_power,
-        n_references=len(np.atleast_2d(plant.references)),
+        n_references=n_references,
         limiter=limiters if several else limiters[0],
         secondary_path_uncertainty=plant.uncertainty,
         fs=plant.fs,
     )
+    return with_internal_model(controller) if options.feedback else controller
 
 
 def _screen(stream: TextIO) -> Callable[[RunStatus], None]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .._types import ChangingPaths, Seed
 from .._validate import as_channels, as_choice, as_count, as_positive
-from ..loop.inputs import SensorNoise, channel_disturbances, require_one_source
+from ..loop.inputs import SensorNoise, channel_disturbances
 from ..loop.schedule import Schedule, path_schedule, steps
 from ..paths.path_matrix import is_path_matrix, path_matrix, secondary_paths
 from ..power.amplifiers import Amplifiers, amplifier_of_each
@@ -157,13 +157,12 @@ class SimulatedInterface:
             raise ValueError(f"latency must be at least a block, {self.block} samples, got {self.latency}")
         self.clock = as_choice(clock, "clock", ("free", "real"))
         self._sensor_noise = SensorNoise(sensor_noise_std, rng)
-        require_one_source(primary_path, disturbance)
-        if reference is None and disturbance is None:
-            raise ValueError("without a reference give disturbance=, what the error microphones hear")
-        if reference is None:
-            self._x = np.empty((0, np.shape(disturbance)[-1]))
-        else:
+        if reference is not None:
             self._x = np.atleast_2d(as_channels(reference, "reference"))
+        elif disturbance is not None:
+            self._x = np.empty((0, as_channels(disturbance, "disturbance").shape[-1]))
+        else:
+            raise ValueError("without a reference give disturbance=, what the error microphones hear")
         self.n_references = len(self._x)
 
         def schedule(paths: Any, name: str, read: Callable[[Any], np.ndarray]) -> Schedule:

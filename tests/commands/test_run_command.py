@@ -6,6 +6,7 @@ import json
 import re
 
 import numpy as np
+import pytest
 
 from kfopc_filterpy.signals import write_wav
 
@@ -71,6 +72,23 @@ def test_the_command_says_if_its_blocks_make_the_anti_noise_late(command, tmp_pa
     assert f"reach {facts['possible_db']:.1f} dB" in out
     assert f"noise reduction {facts['reduction_db'][0]:.1f} dB" in out
     assert f"output power {facts['powers'][0]:.3g} (" in out
+
+
+@pytest.mark.parametrize("source", [[], ["--disturbance", "ear.wav"]], ids=["feedback", "hybrid"])
+def test_the_error_microphone_can_be_a_reference(command, tmp_path, source):
+    tone = 0.1 * np.sin(0.15 * np.arange(X.size))
+    for name, signal in (("noise", 0.1 * X), ("ear", tone + 0.005 * X), ("S", S)):
+        write_wav(tmp_path / f"{name}.wav", signal, FS)
+    noise = "noise.wav" if source else "ear.wav"
+    given = [
+        part if part.startswith("--") else str(tmp_path / part) for part in (noise, "--secondary", "S.wav", *source)
+    ]
+    options = ["--feedback", "--rated-power", "0.1", "--taps", "24", "--block", "32", "--quiet", "--json"]
+    code, out, err = command("run", *given, *options, "--identify", "2", "--listen", "1")
+    assert (code, err) == (0, "")
+    facts = json.loads(out)
+    assert facts["reduction_db"][0] > 15.0
+    assert (facts["stopped_by"], facts["health"]) == ("end", [])
 
 
 def test_a_plant_of_several_channels_is_simulated(command, tmp_path):
