@@ -19,7 +19,7 @@ from ..controllers.processing import RefusedUpdate, process_steps
 from ..paths.uncertainty import GUARD_TAPS
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
-from .faults import GOOD, KINDS, REPEATED, Inspector, is_repeated
+from .faults import GOOD, KINDS, NOT_FINITE, REPEATED, STUCK, Inspector, is_repeated
 from .health import Health
 
 ACTIONS = ("mute", "reset", "freeze")
@@ -48,8 +48,8 @@ class Supervisor(Checkpointed):
     error, it adapts to the next sample, unless an internal model makes a reference of the error.
 
     An internal model needs to know what was really played. So a controller with one gets the errors that it would hear if
-    its own control signals were played as they are, without fades and limits, and in place of a bad error the
-    one that says that there is no noise.
+    its own control signals were played as they are, without fades and limits. In place of an error that is missing, it
+    gets the one that it would hear without noise.
 
     Parameters
     ----------
@@ -300,8 +300,8 @@ class Supervisor(Checkpointed):
             self._note("lost", n_samples=lost)
             self._samples += lost
             self._since_bad_reference = 0
-        bad_errors, usable = self._usable(x, e)
-        e, d = self._as_wanted(e, bad_errors) if self._modelled else (e, e[:0])
+        missing, usable = self._usable(x, e)
+        e, d = self._as_wanted(e, missing) if self._modelled else (e, e[:0])
         wanted, y = self._control(x, e, usable)
         self._limit(y)
         if self._modelled:
@@ -332,7 +332,7 @@ class Supervisor(Checkpointed):
         )
 
     def _usable(self, x: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return which errors are bad, (K, n), and which samples can be learned from, (n,); bad ones are replaced and noted."""
+        """Return which errors are missing, (K, n), and which samples can be learned from, (n,); bad ones are noted."""
         block = np.concatenate((x, e))
         repeated = self.blocks_can_repeat and is_repeated(block, self._last_block)
         self._last_block = block
@@ -342,18 +342,18 @@ class Supervisor(Checkpointed):
                 kind[kind == GOOD] = REPEATED
             self._note_kinds(name, kind)
         bad_x, bad_e = (np.any(kind != GOOD, axis=0) for kind in kinds)
-        if self._modelled:
+        if self._modelled:  # the error is the next reference
             bad_x = bad_x | bad_e
         since, self._since_bad_reference = _samples_since(bad_x, self._since_bad_reference)
         usable = ~bad_x & ~bad_e & (since >= self.recovery_samples)
         self._count_unusable(usable)
-        return kinds[1] != GOOD, usable
+        return np.isin(kinds[1], (NOT_FINITE, STUCK, REPEATED)), usable
 
-    def _as_wanted(self, e: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _as_wanted(self, e: np.ndarray, missing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the errors (K, n) if all that the controller wanted had been played, and the disturbances.
 
         The sound of this block is not in it yet: an estimated path begins with at least a block of zeros. Where an
-        error is bad, the disturbance is zero.
+        error is missing, the disturbance is zero.
         """
         path = np.reshape(self.controller.secondary_path, (self.n_microphones, self.n_loudspeakers, -1))
 
@@ -363,7 +363,7 @@ class Supervisor(Checkpointed):
             return np.tensordot(path, rows, axes=((1, 2), (0, 2)))
 
         wanted = heard(self._wanted_y)
-        errors = np.where(bad, -wanted, e + heard(self._played_y - self._wanted_y))
+        errors = np.where(missing, -wanted, e + heard(self._played_y - self._wanted_y))
         return errors, errors + wanted
 
     def _note_kinds(self, name: str, kinds: np.ndarray) -> None:

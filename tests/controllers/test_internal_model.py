@@ -29,6 +29,7 @@ from kfopc_filterpy.controllers import (
     FeedbackNeutralizer,
     RefusedUpdate,
     VerifiedController,
+    VirtualMicrophones,
     with_internal_model,
 )
 from kfopc_filterpy.realtime import Supervisor
@@ -250,7 +251,13 @@ def test_a_refused_error_leaves_the_state_and_one_that_never_comes_counts_as_sil
         (lambda f: with_internal_model(FxLMS(4, PATHS, step_size=MU, n_references=K - 1)), "for each of the 3 error"),
         (lambda f: FeedbackNeutralizer(f, [0.0, 1.0]), "n_references of 0"),
         (VerifiedController, "no controller with an internal"),
-        (lambda f: Supervisor(f, fs=FS, amplitude_limit=1.0), "must have a reference microphone"),
+        (lambda f: Supervisor(f, fs=FS, amplitude_limit=1.0).process([1.0], [1.0]), "references must be None"),
+        (
+            lambda f: Supervisor(
+                VirtualMicrophones(f, np.ones((2, 1, 4)), [[[1.0]]], physical=[0]), amplitude_limit=1.0
+            ),
+            "must not have virtual microphones",
+        ),
         (lambda f: FxLMS(4, S, step_size=MU).control_signal(None), "with_internal_model"),
         (lambda f: FxLMS(4, S, step_size=MU).process(None, [1.0]), "with_internal_model"),
         (lambda f: simulate(FxLMS(4, S, step_size=MU), None, disturbance=D, secondary_path=S), "with_internal_model"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from kfopc_filterpy import FxLMS, HardClipAmplifier, simulate
+from kfopc_filterpy import FxLMS, HardClipAmplifier, simulate, suggest_settings
+from kfopc_filterpy.bounds import predictor_reference
 from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.realtime import (
     Block,
@@ -150,7 +151,9 @@ def test_a_run_with_an_internal_model(several: bool) -> None:
     interface = Recorded(X[np.newaxis] if several else None, paths, disturbance=d, fs=FS, block=32, latency=64)
 
     def make(plant: IdentifiedPlant) -> Any:
-        assert np.shape(plant.references)[-1] == np.shape(plant.errors)[-1]
+        if not several:
+            best = suggest_settings(predictor_reference(plant.errors), plant.errors, plant.taps, fs=FS, n_taps=24)
+            assert plant.suggested(24).settings == best.settings
         return with_internal_model(
             FxLMS(24, plant.taps, step_size=1e-3, n_references=n_heard + interface.n_microphones)
         )
@@ -419,8 +422,8 @@ class Card:
 class PluggedDevice(SoundDevice):
     """A sound card that asks for a block whenever one is read."""
 
-    def __init__(self, card: Card, **settings: Any) -> None:
-        super().__init__([2], [3], [1], fs=FS, block=32, ahead=1, **settings)
+    def __init__(self, card: Card, references: Sequence[int] = (2,), **settings: Any) -> None:
+        super().__init__(references, [3], [1], fs=FS, block=32, ahead=1, **settings)
         self.card = card
 
     def read(self) -> Any:
@@ -457,6 +460,14 @@ def test_a_sound_card_is_driven_through_its_stream(plugged: Callable[..., Card])
     assert report.health.counts == {"output underflow": 1}
     (event,) = report.health.events
     assert event.time_s == pytest.approx((700 - card.blocks_before_control) * 32 / FS)
+
+
+def test_a_sound_card_needs_no_reference_microphone(plugged: Callable[..., Card]) -> None:
+    device = PluggedDevice(plugged(), references=[])
+    device.start()
+    block = device.read()
+    device.stop()
+    assert (block.references.shape, block.errors.shape, device.n_references) == ((0, 32), (1, 32), 0)
 
 
 def test_lost_and_repeated_blocks_of_a_card_are_in_the_health_record(plugged: Callable[..., Card]) -> None:
