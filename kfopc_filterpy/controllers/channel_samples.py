@@ -50,6 +50,12 @@ def amplified(amplifiers: list[Any] | None, y: np.ndarray) -> np.ndarray:
     return np.array([amplifier(value) for amplifier, value in zip(amplifiers, y.tolist(), strict=True)])
 
 
+def through(paths: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    """Return what paths (outputs, inputs, taps) make of signals (inputs, taps - 1 + n), without their start: (outputs, n)."""
+    rows = np.lib.stride_tricks.sliding_window_view(lines, paths.shape[2], axis=1)[..., ::-1]
+    return np.tensordot(paths, rows, axes=((1, 2), (0, 2)))
+
+
 class ChannelFilters:
     """FIR filters (outputs, inputs, taps) that are given a sample of all inputs at a time."""
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from .._types import ChangingPaths, Seed
 from .._validate import as_channels, as_choice, as_count, as_positive
+from ..controllers.channel_samples import through
 from ..loop.inputs import SensorNoise, channel_disturbances
 from ..loop.schedule import Schedule, path_schedule, steps
 from ..paths.path_matrix import is_path_matrix, path_matrix, secondary_paths
@@ -252,12 +253,11 @@ class _Paths:
     def __call__(self, signals: np.ndarray) -> np.ndarray:
         """Return the outputs, (outputs, n), of the next block, (inputs, n)."""
         heard = np.concatenate((self._line, signals), axis=1)
-        rows = np.lib.stride_tricks.sliding_window_view(heard, self._line.shape[1] + 1, axis=1)[..., ::-1]
         parts, begin, n = [], 0, signals.shape[1]
         while begin < n:
             taps, until = self._schedule.at(self._done + begin)
             end = min(until - self._done, n)
-            parts.append(np.tensordot(taps, rows[:, begin:end], axes=((1, 2), (0, 2))))
+            parts.append(through(taps, heard[:, begin : end + self._line.shape[1]]))
             begin = end
         self._line, self._done = heard[:, n:], self._done + n
         return np.concatenate(parts, axis=1)

@@ -676,6 +676,7 @@ def _fitted(sent: np.ndarray, heard: np.ndarray, n_taps: int, fs: float) -> Path
     correlation = np.fft.irfft(powers.mean(axis=(0, 1)))[: NOISE_TAPS + 1]
     if not correlation[0] > 0.0:
         return first
+    correlation[0] *= 1.0 + 1e-6  # of a pure tone, it would be singular
     whitening = np.append(1.0, -solve_toeplitz(correlation[:-1], correlation[1:]))
     return estimate_path(lfilter(whitening, 1.0, sent), lfilter(whitening, 1.0, heard), n_taps, fs)
 

@@ -14,6 +14,7 @@ from .._types import PerLoudspeaker
 from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..controllers.base import Controller, WrappedController, checked_controller
+from ..controllers.channel_samples import through
 from ..controllers.core_controller import CoreController
 from ..controllers.processing import RefusedUpdate, process_steps
 from ..paths.uncertainty import GUARD_TAPS
@@ -356,14 +357,11 @@ class Supervisor(Checkpointed):
         error is missing, the disturbance is zero.
         """
         path = np.reshape(self.controller.secondary_path, (self.n_microphones, self.n_loudspeakers, -1))
-
-        def heard(signals: np.ndarray) -> np.ndarray:
-            lines = np.pad(signals, ((0, 0), (0, e.shape[1])))
-            rows = np.lib.stride_tricks.sliding_window_view(lines, path.shape[2], axis=1)[..., ::-1]
-            return np.tensordot(path, rows, axes=((1, 2), (0, 2)))
-
-        wanted = heard(self._wanted_y)
-        errors = np.where(missing, -wanted, e + heard(self._played_y - self._wanted_y))
+        wanted, withheld = (
+            through(path, np.pad(y, ((0, 0), (0, e.shape[1]))))
+            for y in (self._wanted_y, self._wanted_y - self._played_y)
+        )
+        errors = np.where(missing, -wanted, e - withheld)
         return errors, errors + wanted
 
     def _note_kinds(self, name: str, kinds: np.ndarray) -> None:
