@@ -384,7 +384,7 @@ def advice_on(verdict: Assessment, *, fs: str = "fs=", n_taps: str = "n_taps=") 
     if verdict.limited_by == "coherence":
         return [
             "Move the reference microphone closer to the source, or add one for each source; shield it from wind and "
-            "other noise."
+            "other noise. Tones that it does not hear can be predicted: try hybrid control (feedback)."
         ]
     if verdict.limited_by == "causality":
         delay = verdict.helpful_delay_s
