@@ -1,7 +1,8 @@
 """Reads a file in a process of its own, whose time and memory are limited, because a damaged file can hang a library.
 
-libhdf5 can loop for ever, or take gigabytes, if a few bytes of a file are changed, and nothing within its process can stop
-it. The process costs 0.2 s. Its memory can be limited on Linux only.
+If a few bytes of a file are changed, libhdf5 can loop for ever, and scipy's reader of MATLAB files can end the process;
+both can take gigabytes. Nothing within the process can stop that. Another one costs 0.2 s. Its memory can be limited on
+Linux only.
 """
 
 from __future__ import annotations
@@ -30,11 +31,19 @@ serve(**job)
 """
 
 
-def read_in_child(read: Callable[..., Content], path: str | os.PathLike[str], *more: str | None) -> Content:
-    """Return what the function `read` returns for a file and more arguments; it must be known by its name."""
+def read_in_child(
+    library: str, read: Callable[..., Content], path: str | os.PathLike[str], *more: str | None
+) -> Content:
+    """Return what the function `read`, which uses `library`, returns for a file and more arguments."""
     limit_s = _LEAST_S + Path(path).stat().st_size / _BYTES_PER_S
-    job = {"function": [read.__module__, read.__name__], "arguments": [os.fspath(path), *more], "limit_s": limit_s}
-    command = [sys.executable, "-c", _RUN, json.dumps(job | {"search": sys.path})]
+    job = {
+        "library": library,
+        "function": [read.__module__, read.__name__],
+        "arguments": [os.fspath(path), *more],
+        "limit_s": limit_s,
+        "search": sys.path,
+    }
+    command = [sys.executable, "-c", _RUN, json.dumps(job)]
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as child:
@@ -53,17 +62,21 @@ def read_in_child(read: Callable[..., Content], path: str | os.PathLike[str], *m
     )
 
 
-def serve(function: tuple[str, str], arguments: list[str], limit_s: float) -> None:
+def serve(library: str, function: tuple[str, str], arguments: list[str], limit_s: float) -> None:
     """Write what a function returns, or its error, to the standard output: a line of JSON, then the samples."""
     faulthandler.dump_traceback_later(limit_s, exit=True)  # also if a library never returns
     module, name = function
     try:
         read = getattr(import_module(module), name)
+        import_module(library)  # which takes its own memory first
         _limit_memory(3 * room_of(arguments[0]))
         content: Content = read(*arguments)
         samples = np.ascontiguousarray(content.samples, dtype=np.float64)
         answer: dict[str, Any] = content._asdict() | {"shape": samples.shape}
         del answer["samples"]
+    except MemoryError:
+        text = "would take more memory than a file of its size may. If it is right, store it uncompressed, or in parts"
+        samples, answer = np.empty(0), {"error": f"{arguments[0]} {text}"}
     except Exception as error:  # noqa: BLE001 - whatever it is, the parent raises it
         samples, answer = np.empty(0), {"error": str(error) or type(error).__name__}
     with open(1, "wb") as output:
@@ -77,7 +90,6 @@ def _limit_memory(n_bytes: int) -> None:
         return
     import resource
 
-    import_module("h5py")  # which takes its own memory first
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + n_bytes
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

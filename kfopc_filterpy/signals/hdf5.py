@@ -26,13 +26,13 @@ _DEFLATE, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # filters of HDF5 that neither run fo
 def read_mat73(path: str | os.PathLike[str], variable: str | None) -> Content:
     """Return one variable of a MATLAB file of version 7.3."""
     _h5py(path)
-    return read_in_child(read_mat73_here, path, variable)
+    return read_in_child("h5py", read_mat73_here, path, variable)
 
 
 def read_sofa(path: str | os.PathLike[str]) -> Content:
     """Return the impulse responses of a SOFA file (AES69), (receivers, sources, n_taps), with their delays."""
     _h5py(path)
-    return read_in_child(read_sofa_here, path)
+    return read_in_child("h5py", read_sofa_here, path)
 
 
 def read_mat73_here(path: str | os.PathLike[str], variable: str | None) -> Content:

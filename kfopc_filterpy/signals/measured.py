@@ -9,7 +9,6 @@ import numpy as np
 
 from .._validate import as_choice, as_positive, as_real_array, as_signal, require_finite
 from .datasets import find_or_fetch, named_dataset
-from .recordings import read_content
 
 _NOISES = ("motor", "compressor")
 
@@ -223,9 +222,11 @@ def load_measured_room(
 def _vectors(
     name: str, folder: str | os.PathLike[str] | None, allow_download: bool, timeout_s: float
 ) -> dict[str, np.ndarray]:
-    """Return the vectors of a dataset, by variable."""
+    """Return the vectors of a dataset, by variable. Its files are the published ones, so no process is needed."""
+    from scipy.io import loadmat
+
     place = find_or_fetch(name, folder, allow_download=allow_download, timeout_s=timeout_s)
     return {
-        file.variable: read_content(place / file.name, variable=file.variable).samples
+        file.variable: np.ravel(loadmat(place / file.name, variable_names=[file.variable])[file.variable])
         for file in named_dataset(name).files
     }

@@ -22,7 +22,7 @@ with atheris.instrument_imports(include=["kfopc_filterpy.paths", "kfopc_filterpy
     from kfopc_filterpy.paths import read_path
     from kfopc_filterpy.signals import read_recording
 
-NAMES = [name for name in WRITERS if name not in ("new.mat", "x.sofa")]  # each HDF5 file takes a process of its own
+NAMES = [name for name in WRITERS if not name.endswith((".mat", ".sofa"))]  # each of these takes a process of its own
 
 
 def read(data: bytes) -> None:
