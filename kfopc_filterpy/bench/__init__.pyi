@@ -9,7 +9,6 @@ from .exploring import ExploreResult as ExploreResult
 from .exploring import ExploreSettings as ExploreSettings
 from .exploring import explore as explore
 from .exploring import explore_setups as explore_setups
-from .exploring import read_setup as read_setup
 from .exploring_page import serve_explore as serve_explore
 from .opening import claims_sentence as claims_sentence
 from .registry import Algorithm as Algorithm

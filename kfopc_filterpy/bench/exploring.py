@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import bandpass_path, clipped_fraction, noise_reduction_db, output_power
+from kfopc_filterpy import SimulationResult, bandpass_path, clipped_fraction, noise_reduction_db, output_power
 from kfopc_filterpy._validate import as_band, as_choice, as_nonnegative, as_number, as_positive, as_signal
 from kfopc_filterpy.bounds import power_constrained_solution
-from kfopc_filterpy.metrics import power_spectrum_db, short_time_power
-from kfopc_filterpy.paths import PathTolerance, path_taps, perturbed_path, read_path
-from kfopc_filterpy.signals import band_limited_noise, has_dataset, load_measured_duct, read_recording
+from kfopc_filterpy.paths import PathTolerance, path_taps, perturbed_path
+from kfopc_filterpy.paths.models import sampling_rate
+from kfopc_filterpy.signals import band_limited_noise, has_dataset, load_measured_duct
 
 from .registry import REGISTRY, make_controller
 from .scene import Scene, louder, make_scene, reachable_weights, with_clipping
@@ -25,12 +24,7 @@ DURATION_S = 3.5
 SWITCH_ON_S = 0.5
 SHORTEST_S = 1.0  # of a recording
 MOST_FS = 16000.0  # files with a higher rate are resampled, so that a run takes a fraction of a second
-POWER_WINDOW_S = 0.05
-POWER_EVERY_S = 0.01
-SEGMENT_S = 0.064  # of the spectra
 ROUNDING = 1e-12
-SIGNALS = ("disturbance", "error", "control_signal", "amplifier_output")  # of a run
-POWERS = ("disturbance_power", "error_power", "asked_power", "delivered_power")  # of these signals
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,17 +36,17 @@ class AcousticSetup:
     name : str
         Name in the page's list.
     primary, secondary : array_like, shape (n_taps,)
-        Taps of the primary path and of the secondary path.
+        Taps of the primary path and of the secondary path, see `paths.read_path`.
     fs : float
-        Sampling frequency in Hz.
+        Sampling frequency in Hz; that of recordings must be the same.
     noise : array_like, shape (n_samples,), optional
         Recording of the reference microphone, of which the first 3.5 s are used; at least 1 s. By default Gaussian noise.
 
     Raises
     ------
     ValueError, TypeError
-        A signal that is empty, not finite or not one-dimensional, a recording that is silent or shorter than 1 s, or fs not
-        above 0.
+        A signal that is empty, not finite, not one-dimensional or sampled at another rate, a recording that is silent or
+        shorter than 1 s, or fs not above 0.
 
     Examples
     --------
@@ -70,11 +64,12 @@ class AcousticSetup:
     def __post_init__(self) -> None:
         fs = as_positive(self.fs, "fs", unit="Hz")
         object.__setattr__(self, "fs", fs)
-        for name in ("primary", "secondary"):
-            object.__setattr__(self, name, as_signal(getattr(self, name), name))
-        if self.noise is None:
+        for name in ("primary", "secondary", "noise"):
+            if (signal := getattr(self, name)) is not None or name != "noise":
+                sampling_rate(signal, fs, name=name)
+                object.__setattr__(self, name, as_signal(signal, name))
+        if (noise := self.noise) is None:
             return
-        noise = as_signal(self.noise, "noise")
         if noise.size < SHORTEST_S * fs:
             raise ValueError(f"noise must last {SHORTEST_S:g} s at least, got {noise.size / fs:.3g} s: record longer")
         if not np.any(noise[: int(DURATION_S * fs)]):
@@ -157,20 +152,10 @@ class ExploreResult:
     ----------
     settings : ExploreSettings
         Settings of the run.
-    fs : float
-        Sampling frequency in Hz.
+    run : SimulationResult
+        The run from switch-on; its signals that depend on the controller are NaN after a divergence.
     rated_power, full_power : float
         Rated power, and the control power that this noise takes without a limit; mean squares.
-    disturbance, error, control_signal, amplifier_output : ndarray, shape (n_samples,)
-        Signals from switch-on; those that depend on the controller are NaN after a divergence.
-    frequencies_hz : ndarray, shape (n_bins,)
-        Frequencies of the spectra, from 0 to fs/2.
-    disturbance_spectrum_db, error_spectrum_db : ndarray, shape (n_bins,)
-        Power densities over the steady half of the run, in dB re 1/Hz.
-    time_s : ndarray, shape (n_times,)
-        Times of the powers in seconds, every 10 ms from 50 ms on.
-    disturbance_power, error_power, asked_power, delivered_power : ndarray, shape (n_times,)
-        Mean squares over the last 50 ms of the disturbance, the error, the control signal and the amplifier's output.
     noise_reduction_db : float
         Noise reduction over the steady half in dB.
     output_power : float
@@ -179,32 +164,17 @@ class ExploreResult:
         Share of that time in which the control signal is beyond the clipping limit.
     bound_db, free_db : float
         Noise reductions of the best fixed filter of this length: within the rated power, and with unlimited power.
-    diverged_at_s : float or None
-        Time at which the run diverged.
     """
 
     settings: ExploreSettings
-    fs: float
+    run: SimulationResult
     rated_power: float
     full_power: float
-    disturbance: np.ndarray
-    error: np.ndarray
-    control_signal: np.ndarray
-    amplifier_output: np.ndarray
-    frequencies_hz: np.ndarray
-    disturbance_spectrum_db: np.ndarray
-    error_spectrum_db: np.ndarray
-    time_s: np.ndarray
-    disturbance_power: np.ndarray
-    error_power: np.ndarray
-    asked_power: np.ndarray
-    delivered_power: np.ndarray
     noise_reduction_db: float
     output_power: float
     clipped_fraction: float
     bound_db: float
     free_db: float
-    diverged_at_s: float | None
 
     @property
     def amplitude_limit(self) -> float:
@@ -215,8 +185,8 @@ class ExploreResult:
     def summary(self) -> str:
         """What the run shows, in words."""
         name = self.settings.algorithm
-        if self.diverged_at_s is not None:
-            return f"{name} diverged {self.diverged_at_s:.3f} s after it was switched on."
+        if self.run.diverged_at_s is not None:
+            return f"{name} diverged {self.run.diverged_at_s:.3f} s after it was switched on."
         change = f"reduces the noise by {self.noise_reduction_db:.1f} dB"
         if self.noise_reduction_db < 0.0:
             change = f"makes the noise {-self.noise_reduction_db:.1f} dB louder"
@@ -263,71 +233,6 @@ def explore_setups() -> list[AcousticSetup]:
     return setups
 
 
-def read_setup(
-    noise: str | os.PathLike[str] | None,
-    primary: str | os.PathLike[str],
-    secondary: str | os.PathLike[str],
-    *,
-    fs: float | None = None,
-    channel: int | None = None,
-    name: str = "Your recording",
-) -> AcousticSetup:
-    """Read a setup from files: a recorded noise, and the impulse responses of the two paths.
-
-    Parameters
-    ----------
-    noise : path or None
-        Recording of the reference microphone; None for Gaussian noise.
-    primary, secondary : path
-        Impulse responses, see `paths.read_path`.
-    fs : float, optional
-        Sampling frequency in Hz to which all files are resampled. By default that of the files, which must agree; files
-        above 16 kHz are resampled to 16 kHz.
-    channel : int, optional
-        Channel of files with several, from 0.
-    name : str, default "Your recording"
-        Name of the setup.
-
-    Returns
-    -------
-    AcousticSetup
-        The setup.
-
-    Raises
-    ------
-    OSError, ValueError, TypeError
-        A file that is missing or that cannot be read, several channels without a choice, sample rates that differ.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from kfopc_filterpy.bench import read_setup
-    >>> from kfopc_filterpy.signals import write_wav
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     for name, signal in (("noise", np.ones(8000)), ("P", [0, 0, 0.5]), ("S", [0, 0.5])):
-    ...         write_wav(f"{folder}/{name}.wav", signal, 8000)
-    ...     setup = read_setup(f"{folder}/noise.wav", f"{folder}/P.wav", f"{folder}/S.wav")
-    >>> setup.noise.size, round(setup.level_db, 1)
-    (8000, -6.0)
-    """
-    readers = {"noise": read_recording, "primary": read_path, "secondary": read_path}
-    files = {"noise": noise, "primary": primary, "secondary": secondary}
-    wanted = {kind: file for kind, file in files.items() if file is not None}
-    read = {kind: readers[kind](file, fs=fs, channel=channel) for kind, file in wanted.items()}
-    rates = {kind: recording.fs for kind, recording in read.items()}
-    if len(set(rates.values())) > 1:
-        listed = ", ".join(f"{files[kind]} {rate:g} Hz" for kind, rate in rates.items())
-        raise ValueError(
-            f"the files must have one sample rate, got {listed}: choose one with the option fs, {min(rates.values()):g} for "
-            "example"
-        )
-    rate = next(iter(rates.values()))
-    if fs is None and rate > MOST_FS:
-        return read_setup(noise, primary, secondary, fs=MOST_FS, channel=channel, name=name)
-    return AcousticSetup(name, fs=rate, **{kind: recording.one_channel() for kind, recording in read.items()})
-
-
 def explore(setup: AcousticSetup, settings: ExploreSettings | None = None) -> ExploreResult:
     """Run one algorithm on the noise of a setup, and return what there is to see and hear.
 
@@ -344,7 +249,7 @@ def explore(setup: AcousticSetup, settings: ExploreSettings | None = None) -> Ex
     Returns
     -------
     ExploreResult
-        Signals, spectra, powers and figures of merit.
+        The run and its figures of merit.
 
     Raises
     ------
@@ -379,27 +284,16 @@ def explore(setup: AcousticSetup, settings: ExploreSettings | None = None) -> Ex
     run = scene.run(make_controller(scene, settings.algorithm, setting))
     with reachable_weights():
         bound = power_constrained_solution(*scene.settled, scene.secondary, N_TAPS, rated)
-    frequencies, of_disturbance = power_spectrum_db(run.disturbance, run.fs, segment_s=SEGMENT_S)
-    shown = slice(round(POWER_WINDOW_S * run.fs) - 1, None, round(POWER_EVERY_S * run.fs))  # from the first full window
-    signals: dict[str, Any] = {name: getattr(run, name) for name in SIGNALS}
-    short_time = (short_time_power(signal, run.fs, POWER_WINDOW_S)[shown] for signal in signals.values())
     return ExploreResult(
         settings=settings,
-        fs=run.fs,
+        run=run,
         rated_power=rated,
         full_power=full,
-        **signals,
-        frequencies_hz=frequencies,
-        disturbance_spectrum_db=of_disturbance,
-        error_spectrum_db=power_spectrum_db(run.error, run.fs, segment_s=SEGMENT_S)[1],
-        time_s=run.time_s[shown],
-        **dict(zip(POWERS, short_time, strict=True)),
         noise_reduction_db=noise_reduction_db(run.error, run.disturbance),
         output_power=output_power(run.control_signal),
         clipped_fraction=clipped_fraction(run.control_signal, scene.amplitude_limit),
         bound_db=bound.noise_reduction_db,
         free_db=scene.wiener_noise_reduction_db,
-        diverged_at_s=run.diverged_at_s,
     )
 
 

@@ -13,18 +13,23 @@ from typing import Any
 
 import numpy as np
 
+from kfopc_filterpy import SimulationResult
 from kfopc_filterpy._validate import as_count, how_to_install
+from kfopc_filterpy.metrics import power_spectrum_db, short_time_power
 from kfopc_filterpy.plot.style import decibels
 
 from .exploring import ALGORITHMS, AcousticSetup, ExploreResult, ExploreSettings, explore, explore_setups
 from .page import data_uri, flac
 from .registry import REGISTRY
-from .study_report import HEADROOM
+from .study_report import loudness
 
 ADDRESS = "127.0.0.1"
 PORT = 5006
 LOWEST_HZ = 50.0
 WAVE_S = 0.03  # of the control signal that is drawn
+SEGMENT_S = 0.064  # of the spectra
+POWER_WINDOW_S, POWER_EVERY_S = 0.05, 0.01
+SOUNDS = ("disturbance", "error")
 BELOW_PEAK_DB = 70.0  # that a spectrum shows
 QUIETEST_DB = -60.0  # re rated power that is drawn
 WIDTH, HEIGHT, SIDE = 470, 285, 290
@@ -171,7 +176,7 @@ class _Page:
         """Set what depends on the setup: the level, and the range of the band."""
         self._is_filling, self._is_new_setup = True, True
         highest = self.setup.fs / 2
-        band, level = self.controls["band"], self.controls["level"]
+        band, level = self.controls["band"], self.controls["level_db"]
         band.end = highest
         band.value = (200.0, min(2000.0, highest)) if self.setup.noise is None else (LOWEST_HZ, highest)
         middle = round(self.setup.level_db)
@@ -187,7 +192,7 @@ class _Page:
         disabled = {
             "relative_rating": kind != RELATIVE,
             "absolute_rating": kind != ABSOLUTE,
-            "tolerance": algorithm != "KF-PB",
+            "path_tolerance_samples": algorithm != "KF-PB",
             "state_noise": symbol != "r",
             "step_size": symbol != "mu",
         }
@@ -197,14 +202,11 @@ class _Page:
     def _settings(self) -> ExploreSettings:
         value: dict[str, Any] = {name: getattr(control, "value", None) for name, control in self.controls.items()}
         is_relative = self.controls["rating_kind"].active == RELATIVE
+        same = ("algorithm", "level_db", "band", "path_error_samples", "path_tolerance_samples")
         return ExploreSettings(
-            algorithm=value["algorithm"],
+            **{name: value[name] for name in same},
             rating_db=value["relative_rating" if is_relative else "absolute_rating"],
             rating_is_relative=is_relative,
-            level_db=value["level"],
-            band=tuple(value["band"]),
-            path_error_samples=value["path_error"],
-            path_tolerance_samples=value["tolerance"],
             state_noise=10.0 ** value["state_noise"],
             step_size=2.0 ** value["step_size"],
             clips=bool(self.controls["clips"].active),
@@ -239,19 +241,20 @@ class _Page:
             self._run()
 
     def _fill(self, result: ExploreResult) -> None:
-        for name, data in curves(result).items():
+        drawn = curves(result)
+        for name, data in drawn.items():
             self.sources[name].data = data
         self._fill_ratings(result)
-        levels = np.concatenate([result.disturbance_spectrum_db, result.error_spectrum_db])
+        levels = np.concatenate([drawn["spectrum"][name] for name in SOUNDS])
         top = np.max(levels, where=np.isfinite(levels), initial=-np.inf)
         self.plots["spectrum"].y_range.update(start=float(top - BELOW_PEAK_DB), end=float(top + 5))
-        self.plots["spectrum"].x_range.end = result.fs / 2
-        asked = self.sources["wave"].data["asked"]
+        self.plots["spectrum"].x_range.end = result.run.fs / 2
+        asked = drawn["wave"]["asked"]
         most = float(np.max(np.abs(asked), initial=0.0, where=np.isfinite(asked)))
         height = 1.15 * min(max(most, result.amplitude_limit), 4 * result.amplitude_limit)
         self.plots["wave"].y_range.update(start=-height, end=height)
         self.texts["summary"].text = f'<p style="margin:0;font-size:15px">{escape(result.summary)}</p>'
-        self.texts["sounds"].text = _players(result)
+        self.texts["sounds"].text = _players(result.run)
 
     def _fill_ratings(self, result: ExploreResult) -> None:
         """Let the slider of the other kind of rating show what the rating is in its terms."""
@@ -269,36 +272,34 @@ class _Page:
 
 def curves(result: ExploreResult) -> dict[str, dict[str, np.ndarray]]:
     """Return the curves of the page's plots: "spectrum", "wave", "power" and "level"."""
-    end = result.control_signal.size if result.diverged_at_s is None else round(result.diverged_at_s * result.fs)
-    last = slice(max(end - round(WAVE_S * result.fs), 0), end)
-    asked, delivered = result.control_signal[last], result.amplifier_output[last]
-    limit = np.full(asked.size, result.amplitude_limit)
-    heard = result.frequencies_hz >= LOWEST_HZ
-    powers = {"asked": result.asked_power, "delivered": result.delivered_power}
-    over = {name: decibels(power / result.rated_power) for name, power in powers.items()}
+    run = result.run
+    end = run.n_samples if run.diverged_at_s is None else round(run.diverged_at_s * run.fs)
+    last = slice(max(end - round(WAVE_S * run.fs), 0), end)
+    limit = np.full(end - last.start, result.amplitude_limit)
+    spectra = {name: power_spectrum_db(getattr(run, name), run.fs, segment_s=SEGMENT_S) for name in SOUNDS}
+    heard = spectra["error"][0] >= LOWEST_HZ
+    shown = slice(round(POWER_WINDOW_S * run.fs) - 1, None, round(POWER_EVERY_S * run.fs))  # from the first full window
+
+    def level(name: str, over: float = 1.0) -> np.ndarray:
+        return decibels(short_time_power(getattr(run, name), run.fs, POWER_WINDOW_S)[shown] / over)
+
+    asked, delivered = (level(name, result.rated_power) for name in ("control_signal", "amplifier_output"))
     return {
-        "spectrum": {
-            "x": result.frequencies_hz[heard],
-            "disturbance": result.disturbance_spectrum_db[heard],
-            "error": result.error_spectrum_db[heard],
-        },
+        "spectrum": {"x": spectra["error"][0][heard], **{name: own[heard] for name, (_, own) in spectra.items()}},
         "wave": {
-            "x": 1000 * np.arange(last.start, end) / result.fs,
-            "asked": asked,
-            "delivered": delivered,
+            "x": 1000 * np.arange(last.start, end) / run.fs,
+            "asked": run.control_signal[last],
+            "delivered": run.amplifier_output[last],
             "upper": limit,
             "lower": -limit,
         },
         "power": {
-            "x": result.time_s,
-            **{name: np.where(level > QUIETEST_DB, level, np.nan) for name, level in over.items()},
-            "rating": np.zeros(result.time_s.size),
+            "x": run.time_s[shown],
+            "asked": np.where(asked > QUIETEST_DB, asked, np.nan),
+            "delivered": np.where(delivered > QUIETEST_DB, delivered, np.nan),
+            "rating": np.zeros(asked.size),
         },
-        "level": {
-            "x": result.time_s,
-            "disturbance": decibels(result.disturbance_power),
-            "error": decibels(result.error_power),
-        },
+        "level": {"x": run.time_s[shown], **{name: level(name) for name in SOUNDS}},
     }
 
 
@@ -326,10 +327,12 @@ def _controls(setups: list[AcousticSetup]) -> dict[str, Any]:
     slide("relative_rating", "Rated power over that of full control (dB)", -30, 10, own.rating_db, 0.5)
     slide("absolute_rating", "Rated power (dB re 1)", -40, 20, 0, 0.5)
     add(CheckboxGroup, "clips", labels=["amplifier clips at its rating"], active=[0])
-    slide("level", "Noise at the error microphone (dB re 1)", -30, 30, 0, 1)
+    slide("level_db", "Noise at the error microphone (dB re 1)", -30, 30, 0, 1)
     slide("band", "Band of the noise (Hz)", LOWEST_HZ, 8000, own.band, 50, format="0")
-    slide("path_error", "True path later than the known path (samples)", 0, 4, 0, 0.5)
-    slide("tolerance", "Path error that KF-PB allows for (samples)", 0, 4, own.path_tolerance_samples, 0.25)
+    slide("path_error_samples", "True path later than the known path (samples)", 0, 4, 0, 0.5)
+    slide(
+        "path_tolerance_samples", "Path error that KF-PB allows for (samples)", 0, 4, own.path_tolerance_samples, 0.25
+    )
     slide("state_noise", "State noise r E[x'²]/q", -9, -3, state_noise, 0.5, format=powers_of_ten)
     slide("step_size", "Step size µ L E[x'²]", -14, 0, step_size, 1, format=powers_of_two)
     return controls
@@ -383,18 +386,17 @@ def _texts() -> dict[str, Any]:
     return {name: Div(name=name, text="", width=2 * WIDTH, **options.get(name, {})) for name in (*options, "sounds")}
 
 
-def _players(result: ExploreResult) -> str:
+def _players(run: SimulationResult) -> str:
     """Return the players of the noise without and with control, which have one scale."""
-    sounds = {"Without control": result.disturbance, "With control": np.nan_to_num(result.error)}
-    peaks = [float(np.max(np.abs(signal))) for signal in sounds.values()]
-    full = min(max(peaks), HEADROOM * peaks[0])
+    signals, full_scale = loudness([run.disturbance, run.error])
     players = []
-    for name, signal in sounds.items():
-        source = data_uri(flac(np.clip(signal / full, -1.0, 1.0), result.fs), "audio/flac")
+    for name, signal in zip(("Without control", "With control"), signals, strict=True):
+        source = data_uri(flac(signal / full_scale, run.fs), "audio/flac")
         players.append(
             f'<figure style="margin:0;display:inline-block;width:445px"><figcaption>{name}</figcaption>'
             f'<audio controls style="width:425px" src="{source}"></audio></figure>'
         )
-    cut = " What exceeds four times the peak of the noise is cut off." if full < max(peaks) else ""
+    is_cut = np.nanmax(np.abs(run.error)) > full_scale
+    cut = " What exceeds four times the peak of the noise is cut off." if is_cut else ""
     note = '<p style="margin:2px 0;color:#555555">Both have one scale. The control is switched on as they begin.'
     return "".join(players) + note + cut + "</p>"

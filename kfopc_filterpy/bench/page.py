@@ -127,16 +127,17 @@ def _image(item: FigureItem, file: Path) -> dict[str, Any]:
 
 def players(study: StudyReport, folder: Path, first_heard: str = "KF-OPC") -> Iterator[dict[str, Any]]:
     """Yield the sounds of each group, which one player switches between, at first to the label with these words."""
-    scaled = zip(study.sounds, loudness(study), strict=True)
-    for number, (group, members) in enumerate(groupby(scaled, key=lambda member: member[0].group)):
+    signals, full_scale = loudness(sound.signal for sound in study.sounds)
+    pairs = zip(study.sounds, signals, strict=True)
+    for number, (group, members) in enumerate(groupby(pairs, key=lambda pair: pair[0].group)):
         tracks = [
             {
                 "label": sound.label,
                 "caveat": _caveat(sound, clipped),
-                "source": data_uri(flac(sound.excerpt(clipped / peak, study.fs), study.fs), "audio/flac"),
+                "source": data_uri(flac(sound.excerpt(clipped / full_scale, study.fs), study.fs), "audio/flac"),
                 "file": file_of(folder, study, sound).relative_to(folder).as_posix(),
             }
-            for sound, (clipped, peak) in members
+            for sound, clipped in members
         ]
         shown = next((i for i, track in enumerate(tracks) if first_heard in track["label"]), min(1, len(tracks) - 1))
         yield {"id": f"{study.name}-sounds-{number}", "group": group, "tracks": tracks, "shown": shown}

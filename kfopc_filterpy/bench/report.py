@@ -109,8 +109,9 @@ def write_files(study: StudyReport, path: Path) -> None:
         prepare_folder(path / kind)
     for item in study.figures:
         save_figure(item.figure, file_of(path, study, item))
-    for sound, (clipped, peak) in zip(study.sounds, loudness(study), strict=True):
-        write_wav(file_of(path, study, sound), clipped, study.fs, peak=peak)
+    signals, full_scale = loudness(sound.signal for sound in study.sounds)
+    for sound, signal in zip(study.sounds, signals, strict=True):
+        write_wav(file_of(path, study, sound), signal, study.fs, peak=full_scale)
     for table in study.tables:
         prepare_folder(path / "tables")
         _write_csv(file_of(path, study, table), table)

@@ -341,17 +341,17 @@ def file_of(folder: Path, study: StudyReport, item: FigureItem | Sound | Table) 
     return folder / kind / f"{study.name}-{item.stem}{suffix}"
 
 
-def loudness(study: StudyReport) -> list[tuple[np.ndarray, float]]:
-    """Return each sound, clipped if it must be, and the one peak that is full scale in all of the study.
+def loudness(signals: Iterable[np.ndarray]) -> tuple[list[np.ndarray], float]:
+    """Return signals, clipped if they must be, and the one peak that is full scale for all of them.
 
-    Full scale is the loudest sound's peak, at most 4 times the first's: a run that diverges would silence the rest.
+    Full scale is the loudest one's peak, at most 4 times the first's: a run that diverges would silence the rest.
     """
-    signals = [np.asarray(sound.signal, dtype=np.float64) for sound in study.sounds]
+    signals = [np.asarray(signal, dtype=np.float64) for signal in signals]
     peaks = [float(np.max(np.abs(signal), initial=0.0, where=~np.isnan(signal))) for signal in signals]
-    if not peaks or max(peaks) == 0:
-        return [(signal, 1.0) for signal in signals]
+    if not any(peaks):
+        return signals, 1.0
     full_scale = min(max(peaks), HEADROOM * peaks[0]) if peaks[0] > 0 else max(peaks)
-    return [(np.clip(signal, -full_scale, full_scale), full_scale) for signal in signals]
+    return [np.clip(signal, -full_scale, full_scale) for signal in signals], full_scale
 
 
 def _require_stem(name: str, argument: str) -> None:

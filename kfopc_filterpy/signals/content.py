@@ -73,7 +73,8 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, ValueError) and str(path) in str(error):
             raise
-        raise ValueError(f"{path} cannot be read as {what}: {str(error) or type(error).__name__}") from error
+        reason = str(error) or type(error).__name__
+        raise ValueError(f"{path} cannot be read as {what}: {reason}; is it damaged or cut short?") from error
 
 
 def optional_module(name: str, path: str | os.PathLike[str], what: str) -> ModuleType:

@@ -58,11 +58,11 @@ return Bokeh.index.find_one(model).shadow_el.querySelectorAll(arguments[1])
 ALL = ("spectrum", "wave", "power", "level")
 MOVES = [
     ("relative_rating", ".noUi-handle", "LEFT", ALL),
-    ("level", ".noUi-handle", "RIGHT", ("spectrum", "wave", "level")),
+    ("level_db", ".noUi-handle", "RIGHT", ("spectrum", "wave", "level")),
     ("band", ".noUi-handle-upper", "LEFT", ALL),
     ("band", ".noUi-handle-lower", "RIGHT", ALL),
-    ("path_error", ".noUi-handle", "RIGHT", ALL),
-    ("tolerance", ".noUi-handle", "RIGHT", ALL),
+    ("path_error_samples", ".noUi-handle", "RIGHT", ALL),
+    ("path_tolerance_samples", ".noUi-handle", "RIGHT", ALL),
     ("rating_kind", ".bk-btn:nth-child(2)", None, ()),
     ("absolute_rating", ".noUi-handle", "RIGHT", ALL),
     ("clips", "input", None, ALL),

@@ -349,8 +349,8 @@ CUT = {
     "x.flac": "cannot be read as an audio file|is cut short",
     "x.npy": "is damaged: its header claims 4800 bytes of data, shape .*, but 4600 are there",
     "x.npz": "cannot be read as a .npz file: File is not a zip file",
-    "packed.mat": "is cut short",
-    "plain.mat": "is cut short",
+    "packed.mat": "cannot be read as a MAT file.* cut short",
+    "plain.mat": "cannot be read as a MAT file.* cut short",
     "four.mat": "cannot be read as a MAT file",
     "new.mat": "cannot be read as a MAT file",
     "rew.txt": r"is damaged or cut short: its header claims 300 samples, got \(2\d\d,\)",
@@ -395,8 +395,8 @@ def test_a_header_that_lies_is_refused(tmp_path):
         ("x.aiff", r"is cut short: its header claims 10000000\d\d bytes, 1254 are there"),
         ("x.flac", r"is cut short|cannot be read as an audio file"),
         ("x.npy", r"is damaged: its header claims 15984 bytes of data, shape \(2, 999\), but 4800 are there"),
-        ("four.mat", r"is damaged: its header claims the shape \(1000000000, 1\)"),
-        ("plain.mat", r"is damaged: its header claims the shape \(1000000000, 1\)"),
+        ("four.mat", r"claims 1e\+09 samples"),
+        ("plain.mat", r"claims 1e\+09 samples"),
     ):
         with pytest.raises(ValueError, match=rf"{name}.* {message}|{message}"):
             read_recording(tmp_path / name, fs=FS)
