@@ -6,6 +6,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable
 from fractions import Fraction
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -218,3 +219,11 @@ def as_generator(rng: Any) -> np.random.Generator:
 def how_to_install(extra: str) -> str:
     """Return how to install an extra: the package is on no index, so its clone is named."""
     return f'install the extra `{extra}`, in the clone: python -m pip install -e ".[{extra}]"'
+
+
+def optional_module(name: str, extra: str, what: str) -> Any:
+    """Return a module that an extra brings; where it is missing, the message says that `what` needs it."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ModuleNotFoundError(f"{what} needs {name}: {how_to_install(extra)}", name=name) from error

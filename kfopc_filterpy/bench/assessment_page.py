@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from datetime import datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, __version__
-from kfopc_filterpy._validate import how_to_install
+from kfopc_filterpy._validate import optional_module
 from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
 from kfopc_filterpy.plot.style import new_axes
@@ -36,9 +35,8 @@ CHAIN = (  # what each ceiling may use, and the cause if it is too low
 
 def require_page() -> None:
     """Raise ModuleNotFoundError, which names the extra, if a library that the page needs is missing."""
-    missing = [name for name in NEEDED if find_spec(name) is None]
-    if missing:
-        raise ModuleNotFoundError(f"the page needs {', '.join(missing)}: {how_to_install('studies')}")
+    for name in NEEDED:
+        optional_module(name, "studies", "the page")
 
 
 def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Path:

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Iterator
 from functools import partial
 
-from .._validate import how_to_install
+from .._validate import optional_module
 from .options import DONE, Parser, add_command
 
 EXAMPLES = """examples:
@@ -25,10 +25,7 @@ def add_to(commands: argparse._SubParsersAction[Parser], whole: Parser) -> None:
 
 def completion(whole: Parser, options: argparse.Namespace) -> int:
     """Print the script."""
-    try:
-        import shtab
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"completion needs shtab: {how_to_install('studies')}") from error
+    shtab = optional_module("shtab", "studies", "completion")
     for action in _actions(whole):
         name = action.metavar or action.dest
         if name in FILES + FOLDERS:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .._validate import how_to_install
+from .._validate import optional_module
 
 
 def warn(options: argparse.Namespace, message: str, kind: str = "warning") -> None:
@@ -33,10 +33,7 @@ def say_written(options: argparse.Namespace, page: Path, beside: str) -> None:
 @contextmanager
 def progress_bar(options: argparse.Namespace, unit: str) -> Iterator[Any]:
     """Yield a progress bar, which is shown on a terminal only."""
-    try:
-        from tqdm import tqdm
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"the progress bar needs tqdm: {how_to_install('studies')}") from error
+    tqdm = optional_module("tqdm", "studies", "the progress bar")
     quiet = True if options.quiet else None
-    with tqdm(unit=unit, unit_scale=True, disable=quiet, dynamic_ncols=True, leave=False) as bar:
+    with tqdm.tqdm(unit=unit, unit_scale=True, disable=quiet, dynamic_ncols=True, leave=False) as bar:
         yield bar

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from .._types import PathModel
 from .._validate import as_band, as_number, as_positive, as_signal
+from .file_checks import require_sound
 from .models import finite_taps, path_taps, sampling_rate
 from .path_matrix import PRIMARY_AXES, SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 
@@ -475,22 +476,13 @@ def causality_margin(
     if share >= 1:
         raise ValueError(f"onset_share must be below 1, got {share:g}")
     several = is_path_matrix(primary) or is_path_matrix(secondary)
-    if several:
-        p, fs = sampled_path_matrix(primary, fs, "primary", PRIMARY_AXES)
-        s, fs = sampled_path_matrix(secondary, fs, "secondary", SECONDARY_AXES)
-    else:
-        fs = sampling_rate(primary, fs, name="primary")
-        sampling_rate(secondary, fs, name="secondary")
-        p, s = (path_taps(h, name=n).reshape(1, 1, -1) for h, n in ((primary, "primary"), (secondary, "secondary")))
+    p, fs = sampled_path_matrix(primary, fs, "primary", PRIMARY_AXES)
+    s, fs = sampled_path_matrix(secondary, fs, "secondary", SECONDARY_AXES)
     low, high = (0.0, fs / 2) if band is None else as_band(band, fs)
     if len(p) != len(s):
         raise ValueError(f"primary and secondary must have the same K microphones first, got {len(p)} and {len(s)}")
-    for name, paths, source in (("primary", p, "reference"), ("secondary", s, "loudspeaker")):
-        for k in np.flatnonzero(~np.any(paths, axis=(1, 2))):
-            which, why = name, "a silent path has no delay"
-            if several:
-                which, why = f"{name}[{k}]", f"no {source} reaches that microphone; leave it out"
-            raise ValueError(f"{which} must not be all zeros: {why}")
+    require_sound("primary", p)
+    require_sound("secondary", s)
 
     def of_each(paths: np.ndarray, measure: Callable[[np.ndarray], float]) -> np.ndarray:
         return np.array([[measure(h) if np.any(h) else np.inf for h in row] for row in paths])

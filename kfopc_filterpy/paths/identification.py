@@ -26,7 +26,7 @@ from .._validate import (
 from ..power.amplifiers import amplifier_of_each
 from .analysis import responses_of_both
 from .least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve, ridge_solve
-from .models import fir_path, path_taps, sampling_rate
+from .models import fir_path, path_taps
 from .path_matrix import SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 from .uncertainty import relative_to
 
@@ -400,16 +400,12 @@ def identify_secondary_path(
     ((2, 2, 3), True)
     """
     several = is_path_matrix(secondary_path)
-    if several:
-        true, fs = sampled_path_matrix(secondary_path, fs, "secondary_path", SECONDARY_AXES)
-        for k, j in np.argwhere(~np.any(true, axis=2)):
-            raise ValueError(
-                f"secondary_path[{k}][{j}] must not be all zeros: an error relative to it is undefined; leave out the "
-                "loudspeaker if it is unplugged, or the microphone if it is dead"
-            )
-    else:
-        fs = sampling_rate(secondary_path, fs, name="secondary_path")
-        true = path_taps(secondary_path, name="secondary_path").reshape(1, 1, -1)
+    true, fs = sampled_path_matrix(secondary_path, fs, "secondary_path", SECONDARY_AXES)
+    for k, j in np.argwhere(~np.any(true, axis=2)):
+        raise ValueError(
+            f"secondary_path[{k}][{j}] must not be all zeros: an error relative to it is undefined; leave out the "
+            "loudspeaker if it is unplugged, or the microphone if it is dead"
+        )
     K, J, _ = true.shape
     n_samples = round(as_positive(duration_s, "duration_s", unit="s") * fs)
     n_taps = as_count(n_taps, "n_taps")

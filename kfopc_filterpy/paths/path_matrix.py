@@ -63,7 +63,7 @@ def path_matrix(
     """Return paths as taps (outputs, inputs, n_taps), and their sampling rate in Hz if systems tell it."""
     if is_system(paths):
         if (paths.noutputs, paths.ninputs) == (1, 1):
-            return _from_systems([[paths]], fs, name, axes)
+            return path_taps(paths, fs=fs, name=name).reshape(1, 1, -1), sampling_rate(paths, fs, name=name)
         rows = [[paths[k, j] for j in range(paths.ninputs)] for k in range(paths.noutputs)]
         return _from_systems(rows, fs, name, axes)
     if _has_systems(paths):

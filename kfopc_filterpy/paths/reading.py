@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from .._validate import as_rate_ratio
 from ..signals.content import Content, require_room
 from ..signals.recordings import Recording, rates_of, read_content, scaled
 from .resampling import resample_path
@@ -99,7 +98,9 @@ def path_of(
     if content.start_s:
         taps = _from_time_zero(path, taps, content.start_s * rate)
     if wanted != rate:
-        taps = _resampled(path, taps, rate, wanted)
+        require_room(path, taps.size * wanted / rate, what=f"resampled from {rate:g} to {wanted:g} Hz it has")
+        rows = [resample_path(row, wanted, fs=rate) for row in taps.reshape(-1, taps.shape[-1])]
+        taps = np.reshape(rows, (*taps.shape[:-1], -1))
     return Recording(taps, wanted, unit, Path(path).name, stated)
 
 
@@ -118,11 +119,3 @@ def _from_time_zero(path: str | os.PathLike[str], taps: np.ndarray, start: float
             "(a loopback), or give it a start time at which it is causal"
         )
     return np.ascontiguousarray(rest)
-
-
-def _resampled(path: str | os.PathLike[str], taps: np.ndarray, fs: float, new_fs: float) -> np.ndarray:
-    up, down = as_rate_ratio(fs, new_fs)
-    require_room(path, taps.size * up / down, what=f"resampled from {fs:g} to {new_fs:g} Hz it has")
-    rows = taps.reshape(-1, taps.shape[-1])
-    resampled = np.array([resample_path(row, new_fs, fs=fs) for row in rows])
-    return resampled.reshape(*taps.shape[:-1], -1)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validate import as_count, as_number, as_positive, as_real_array, how_to_install, require_finite
+from .._validate import as_count, as_number, as_positive, as_real_array, optional_module, require_finite
 
 WALLS = ("west", "east", "south", "north", "floor", "ceiling")
 """Names of the walls: at x = 0 and its maximum, at y = 0 and its maximum, at z = 0 and its maximum."""
@@ -386,10 +386,4 @@ def _pulses(arrivals: np.ndarray, amplitudes: np.ndarray, n_taps: int) -> np.nda
 
 
 def _pyroomacoustics() -> Any:
-    try:
-        import pyroomacoustics
-    except ImportError as error:
-        raise ImportError(
-            f"room_paths needs pyroomacoustics, which is not installed: {how_to_install('rooms')}"
-        ) from error
-    return pyroomacoustics
+    return optional_module("pyroomacoustics", "rooms", "room_paths")

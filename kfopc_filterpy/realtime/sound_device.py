@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .._validate import as_count, as_positive, how_to_install
+from .._validate import as_count, as_positive, optional_module
 from .interfaces import Block
 from .running import FaultError
 
@@ -167,12 +167,9 @@ def _indices(channels: Sequence[int], name: str) -> list[int]:
 def _sounddevice() -> Any:
     """Return the module sounddevice."""
     try:
-        import sounddevice
-    except ImportError as error:
-        raise ImportError(f"SoundDevice needs sounddevice: {how_to_install('realtime')}") from error
+        return optional_module("sounddevice", "realtime", "SoundDevice")
     except OSError as error:
         raise ImportError(
             f"sounddevice did not find the PortAudio library ({error}): install it, for example with "
             "'apt install libportaudio2'"
         ) from error
-    return sounddevice

@@ -6,16 +6,10 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-
-from .._validate import how_to_install
-
-if TYPE_CHECKING:
-    from types import ModuleType
 
 _LEAST_ROOM = 64 * 2**20  # bytes of float64 samples that any file may hold
 _ROUNDED = 0.35  # share by which a step between times may differ: they are written with few digits
@@ -75,16 +69,6 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
             raise
         reason = str(error) or type(error).__name__
         raise ValueError(f"{path} cannot be read as {what}: {reason}; is it damaged or cut short?") from error
-
-
-def optional_module(name: str, path: str | os.PathLike[str], what: str) -> ModuleType:
-    """Return a module of the extra `formats`, or say how to install it."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ModuleNotFoundError(
-            f"{path} is {what}, which needs {name}: {how_to_install('formats')}", name=name
-        ) from error
 
 
 def channels_first(array: np.ndarray) -> np.ndarray:

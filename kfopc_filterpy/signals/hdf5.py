@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from .._validate import optional_module
 from .child import read_in_child
-from .content import Content, chosen_variable, optional_module, require_room
+from .content import Content, chosen_variable, require_room
 
 NUMERIC_CLASSES = (
     "double",
@@ -115,7 +116,7 @@ def _delayed(path: str | os.PathLike[str], taps: np.ndarray, delays: np.ndarray)
 
 
 def _h5py(path: str | os.PathLike[str]) -> Any:
-    return optional_module("h5py", path, "an HDF5 file")
+    return optional_module("h5py", "formats", f"{path} is an HDF5 file, which")
 
 
 def _matlab_class(path: str | os.PathLike[str], file: Any, name: str) -> str:

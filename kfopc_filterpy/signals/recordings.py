@@ -250,10 +250,13 @@ def recording_of(
             f"{path} must hold signals, (n_channels, n_samples), got shape {content.samples.shape}; read impulse responses "
             "with paths.read_path"
         )
+    from scipy.signal import resample_poly
+
     rate, wanted, stated = rates_of(path, content, fs, file_fs)
     samples, unit = scaled(content, unit, unit_per_full_scale)
     if wanted != rate:
-        samples = _resampled(path, samples, rate, wanted)
+        require_room(path, samples.size * wanted / rate, what=f"resampled from {rate:g} to {wanted:g} Hz it has")
+        samples = resample_poly(samples, *as_rate_ratio(rate, wanted), axis=-1)
     return Recording(samples, wanted, unit, Path(path).name, stated)
 
 
@@ -411,14 +414,6 @@ def scaled(content: Content, unit: str | None, unit_per_full_scale: float | None
     if unit is None:
         raise ValueError('unit_per_full_scale needs the unit of its result: pass unit="Pa" or unit="V", for example')
     return content.samples * as_positive(unit_per_full_scale, "unit_per_full_scale"), unit
-
-
-def _resampled(path: str | os.PathLike[str], samples: np.ndarray, fs: float, new_fs: float) -> np.ndarray:
-    from scipy.signal import resample_poly
-
-    up, down = as_rate_ratio(fs, new_fs)
-    require_room(path, samples.size * up / down, what=f"resampled from {fs:g} to {new_fs:g} Hz it has")
-    return resample_poly(samples, up, down, axis=-1)
 
 
 def write_wav(path: str | os.PathLike[str], signal: ArrayLike, fs: float, *, peak: float | None = None) -> None:

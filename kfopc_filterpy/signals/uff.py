@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from .content import Content, optional_module, rate_of_step
+from .._validate import optional_module
+from .content import Content, rate_of_step
 
 _IN_TIME = {0: "general", 1: "time response", 25: "FIR filter"}  # function types whose samples may be in time
 _PADDED = re.compile(rb"^((?: *[-+]?\d\.\d+[eE][-+]\d+)+) +(?=\r?$)", re.MULTILINE)  # a row of numbers, then blanks
@@ -20,7 +21,7 @@ _BINARY = re.compile(rb"^    58b", re.MULTILINE)
 
 def read_uff(path: str | os.PathLike[str]) -> Content:
     """Return the time signals of a UFF file, one channel for each data set 58, and their rate and unit."""
-    pyuff = optional_module("pyuff", path, "a UFF file")
+    pyuff = optional_module("pyuff", "formats", f"{path} is a UFF file, which")
     content = Path(path).read_bytes()
     if _PADDED.search(content) is None or _BINARY.search(content):
         return _from_pyuff(path, pyuff.UFF(os.fspath(path)))
