@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,8 @@ from .report import write_files, write_whole
 from .study_report import SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Sound, StudyReport, Table
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from .assessment import Assessment
 
 TEMPLATE = "verdict.html.jinja"
@@ -79,59 +81,63 @@ def _figures(verdict: Assessment) -> Iterator[FigureItem]:
     if np.all(np.isfinite(verdict.least_rated_power)):
         caption += f" Least: the least with which {verdict.algorithm}, which adapts, reaches what is wanted."
     yield FigureItem("bound", caption, _bound(verdict).figure)
-    yield from error_figures(
+    yield from run_figures(
         verdict.runs,
+        verdict.limits.rated_power,
+        verdict.watt_per_power,
         verdict.switch_on_s,
         together="" if verdict.channels is None else " All microphones together.",
         pascal_per_unit=verdict.pascal_per_unit,
     )
-    _, n_loudspeakers, n_microphones = verdict.channels or (1, 1, 1)
-    figure, axes = _rows_of_axes(n_loudspeakers, (6.4, 4))
-    watts = verdict.watt_per_power
-    for j, ax in enumerate(axes):
-        watt = None if watts is None else np.ravel(watts)[j]
-        rated = np.ravel(verdict.limits.rated_power)[j]
-        plot_output_power(verdict.runs, channel=j, rated_power=rated, watt_per_power=watt, ax=ax)
-        ax.set_xlabel(SINCE_SWITCH_ON)
-    _number_rows(axes, "Loudspeaker")
-    begin = SWITCHED_ON.format(verdict.switch_on_s)
-    yield FigureItem("power", f"Mean power of the control signal, and the rated power. {begin}", figure)
-    if verdict.levels is not None:
-        levels = verdict.levels
-        figure, axes = _rows_of_axes(n_microphones, (9, 3.6))
-        for k, ax in enumerate(axes):
-            _draw_bands(levels.centres_hz, np.atleast_2d(levels.before_db)[k], np.atleast_2d(levels.after_db)[k], ax)
-        _number_rows(axes, "Microphone")
+    if (levels := verdict.levels) is not None:
+        pairs = np.atleast_2d(levels.before_db), np.atleast_2d(levels.after_db)
+
+        def bands(k: int, ax: Any) -> None:
+            _draw_bands(levels.centres_hz, pairs[0][k], pairs[1][k], ax)
+
+        figure = _one_below_another(len(pairs[0]), "Microphone", (9, 3.6), bands)
         yield FigureItem("third-octaves", f"Third-octave bands without control and with {verdict.algorithm}.", figure)
 
 
-def error_figures(
-    runs: Mapping[str, SimulationResult], switch_on_s: float, *, together: str = "", pascal_per_unit: Any = None
+def run_figures(
+    runs: Mapping[str, SimulationResult],
+    rated_power: Any,
+    watt_per_power: Any,
+    switch_on_s: float,
+    *,
+    together: str = "",
+    pascal_per_unit: Any = None,
 ) -> Iterator[FigureItem]:
-    """Yield the spectra of the errors, and their power over time; `together` is added to both captions."""
+    """Yield the spectra of the errors and their power over time, captions with `together`, and each loudspeaker's power."""
+    begin = SWITCHED_ON.format(switch_on_s)
     ax: Any = plot_error_spectra(runs, pascal_per_unit=pascal_per_unit)
     caption = f"Spectra without control and of the errors, over the steady half.{together}"
     yield FigureItem("spectra", caption, ax.figure)
     ax = plot_nse(runs)
     ax.set_xlabel(SINCE_SWITCH_ON)
     caption = "Error power over that of the disturbance; below 0 dB it is quieter than without control."
-    yield FigureItem("nse", f"{caption}{together} {SWITCHED_ON.format(switch_on_s)}", ax.figure)
+    yield FigureItem("nse", f"{caption}{together} {begin}", ax.figure)
+
+    def power(j: int, ax: Any) -> None:
+        watt = None if watt_per_power is None else np.ravel(watt_per_power)[j]
+        plot_output_power(runs, channel=j, rated_power=np.ravel(rated_power)[j], watt_per_power=watt, ax=ax)
+        ax.set_xlabel(SINCE_SWITCH_ON)
+
+    figure = _one_below_another(np.size(rated_power), "Loudspeaker", (6.4, 4), power)
+    yield FigureItem("power", f"Mean power of the control signal, and the rated power. {begin}", figure)
 
 
-def _rows_of_axes(count: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    """Return a figure with axes below each other, and the axes."""
+def _one_below_another(count: int, what: str, size: tuple[float, float], draw: Callable[[int, Any], None]) -> Figure:
+    """Return a figure of axes below each other, each drawn; the labels of several begin with what they show, numbered."""
     import matplotlib.pyplot as plt
 
     height = size[1] * (1.0 if count == 1 else 0.8 * count)
     figure, axes = plt.subplots(count, squeeze=False, figsize=(size[0], height), layout="constrained")
-    return figure, axes[:, 0]
-
-
-def _number_rows(axes: Any, what: str) -> None:
-    """Begin the labels of several axes with what they show, and its number."""
-    if len(axes) > 1:
-        for number, ax in enumerate(axes, 1):
-            ax.set_ylabel(f"{what} {number}\n{ax.get_ylabel()}")
+    for i, ax in enumerate(axes[:, 0]):
+        draw(i, ax)
+        if count > 1:
+            ax.set_ylabel(f"{what} {i + 1}\n{ax.get_ylabel()}")
+    return figure
 
 
 def _bound(verdict: Assessment) -> Any:

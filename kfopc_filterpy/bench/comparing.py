@@ -16,11 +16,12 @@ from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 from .._types import PathModels, ProgressBar
 from .assessed_runs import recorded_scene
 from .assessing import recorded_signals, switch_on_sample
+from .assessment_page import run_figures
 from .fixed_filters import longest_filter
 from .limits import ChannelLimits, Ratings, limits_of, ratings_of_each, watt_per_power
 from .registry import REGISTRY, algorithms
 from .scene import Runs, Scene, figures_of_merit, one_blas_thread, reachable_solution, reachable_weights
-from .study_report import SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Parameter, Sound, StudyReport, Table
+from .study_report import Parameter, Sound, StudyReport, Table
 from .tuning import RULE, AllDivergedError, run_setting, tune
 
 OF_ONE_CHANNEL = ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS")
@@ -149,7 +150,7 @@ def compare_recordings(
         1.0 if isinstance(limits, ChannelLimits) else limits.rated_power,
         {"n_taps": Parameter(settings.n_taps, settings.reasons["n_taps"]), **parameters},
         {name: figures_of_merit([result], scene) for name, result in results.items()},
-        figures=_figures(results, np.atleast_1d(limits.rated_power), watts, start / fs),
+        figures=list(run_figures(results, limits.rated_power, watts, start / fs)),
         sounds=sounds,
         notes=[*notes, *remarks],
         tables=[_power_table(results, scene)] if several else [],
@@ -161,25 +162,6 @@ def compare_recordings(
             "rating_decided_by": limits.decided_by,
         },
     )
-
-
-def _figures(
-    results: dict[str, SimulationResult], rated_powers: np.ndarray, watts: Any, switch_on_s: float
-) -> list[FigureItem]:
-    """Return the figures of the runs: the error, and the power of each loudspeaker."""
-    from kfopc_filterpy.plot import plot_output_power
-
-    from .assessment_page import error_figures
-
-    items = list(error_figures(results, switch_on_s))
-    for j, rated in enumerate(rated_powers):
-        which, end = (f" of loudspeaker {j + 1}", f"-{j + 1}") if rated_powers.size > 1 else ("", "")
-        watt = None if watts is None else np.ravel(watts)[j]
-        ax: Any = plot_output_power(results, channel=j, rated_power=rated, watt_per_power=watt)
-        ax.set_xlabel(SINCE_SWITCH_ON)
-        caption = f"Mean power of the control signal{which}, and its rated power. {SWITCHED_ON.format(switch_on_s)}"
-        items.append(FigureItem(f"power{end}", caption, ax.figure))
-    return items
 
 
 def _power_table(results: dict[str, SimulationResult], scene: Scene) -> Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from html import escape
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def prose(text: str) -> Markup:
     >>> print(prose("q < 2.5e-06, P > 1e3"))
     q &lt; 2.5 × 10<sup>−6</sup>, P &gt; 10<sup>3</sup>
     """
-    from markupsafe import Markup, escape
+    from markupsafe import Markup
 
     def shown(found: re.Match[str]) -> str:
         if tex := FORMULAS.get(found[0]):
@@ -91,11 +92,7 @@ def prose(text: str) -> Markup:
         factor = "" if float(found["factor"]) == 1 else f"{found['factor']} × "
         return f"{factor}10<sup>{str(int(found['exponent'])).replace('-', _MINUS)}</sup>"
 
-    parts, end = [], 0
-    for found in _MATHEMATICS.finditer(text):
-        parts += [escape(text[end : found.start()]), shown(found)]
-        end = found.end()
-    return Markup("").join(map(Markup, [*parts, escape(text[end:])]))
+    return Markup(_MATHEMATICS.sub(shown, escape(text, quote=False)))  # quotes are parts of formulas
 
 
 def parameter(name: str) -> tuple[Markup | str, str]:

@@ -114,7 +114,9 @@ def write_files(study: StudyReport, path: Path) -> None:
         write_wav(file_of(path, study, sound), signal, study.fs, peak=full_scale)
     for table in study.tables:
         prepare_folder(path / "tables")
-        _write_csv(file_of(path, study, table), table)
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([table.headings, *table.rows])
+        write_whole(file_of(path, study, table), text.getvalue())
 
 
 def results_table(studies: Sequence[StudyReport]) -> str:
@@ -183,14 +185,6 @@ def aligned(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
     sides = ["<" if i in left else ">" for i in range(len(widths))]
     line = "  ".join(f"{{:{side}{width}}}" for side, width in zip(sides, widths, strict=True))
     return [line.format(*row).rstrip() for row in rows]
-
-
-def _write_csv(path: Path, table: Table) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(table.headings)
-    writer.writerows(table.rows)
-    write_whole(path, text.getvalue())
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -269,7 +269,16 @@ def best_setting(scene: Scene, algorithm: str, trials: Sequence[Trial]) -> Tuned
     >>> best_setting(scene, "KF-OPC", trials).setting, best_setting(scene, "KF-ANC", trials).setting
     (1e-07, 1e-06)
     """
-    return _best(trials, scene.rated_power if REGISTRY[algorithm].keeps_budget else np.inf)
+    stable = [trial for trial in trials if not trial.diverged]
+    if not stable:
+        return None
+    most = BUDGET * scene.rated_power if REGISTRY[algorithm].keeps_budget else np.inf
+    kept = [trial for trial in stable if np.all(trial.output_power <= most)]
+    best = min(kept or stable, key=lambda trial: (round(trial.mean_nse_db, 2), trial.setting))
+    tried = np.array([np.atleast_1d(trial.setting) for trial in trials])
+    least, largest = tried.min(axis=0), tried.max(axis=0)
+    at_edge = ((best.setting == least) | (best.setting == largest)) & (least < largest)
+    return Tuned(best.setting, bool(kept), bool(np.any(at_edge)), list(trials))
 
 
 def tune(
@@ -337,19 +346,3 @@ def _refined(runs: Runs, scene: Scene, algorithm: str, trials: Sequence[Trial], 
         return best
     own = try_settings(runs, scene, {algorithm: finer}, seeds, planned=False)[algorithm]
     return best_setting(scene, algorithm, [*trials, *own]) or best
-
-
-def _best(trials: Sequence[Trial], rated_power: Any) -> Tuned | None:
-    stable = [trial for trial in trials if not trial.diverged]
-    if not stable:
-        return None
-    kept = [trial for trial in stable if np.all(trial.output_power <= BUDGET * rated_power)]
-    best = min(kept or stable, key=lambda trial: (round(trial.mean_nse_db, 2), trial.setting))
-    return Tuned(best.setting, bool(kept), _at_edge(best.setting, trials), list(trials))
-
-
-def _at_edge(setting: Setting, trials: Sequence[Trial]) -> bool:
-    tried = np.array([np.atleast_1d(trial.setting) for trial in trials])
-    own = np.atleast_1d(setting)
-    least, most = tried.min(axis=0), tried.max(axis=0)
-    return bool(np.any(((own == least) | (own == most)) & (least < most)))

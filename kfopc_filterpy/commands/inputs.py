@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .options import refuse_unused
 from .printing import warn
 
 if TYPE_CHECKING:
@@ -65,23 +66,22 @@ class Files:
 
     def recording(self, path: str) -> np.ndarray:
         """Return the samples of a recording, one channel."""
-        return _only_channel(self._recording(path), path)
+        return self._read(path, is_path=False).one_channel()
 
     def path(self, path: str) -> np.ndarray:
         """Return the taps of a path."""
-        return _only_channel(self._read(path, is_path=True), path)
+        return self._read(path, is_path=True).one_channel()
 
     def calibrator(self, path: str) -> Recording:
-        """Return the recording of a calibrator, one channel, at any rate."""
+        """Return the recording of a calibrator, at any rate."""
         with _file(path) as source:
-            read = self._chosen(path, source, False, None)
-        return replace(read, samples=_only_channel(read, path))
+            return self._chosen(path, source, False, None)
 
     def channels(self, path: str) -> np.ndarray:
         """Return all channels of a recording, (n_channels, n_samples), none of them silent."""
         from ..paths.file_checks import require_heard
 
-        channels = np.atleast_2d(self._recording(path).samples)
+        channels = np.atleast_2d(self._read(path, is_path=False).samples)
         require_heard(path, channels)
         return channels
 
@@ -96,6 +96,8 @@ class Files:
 
     def matrix(self, paths: Sequence[str], option: str, n_microphones: int | None = None) -> np.ndarray:
         """Return the taps of paths, (microphones, sources, taps); see the examples of `verdict` for their order."""
+        from ..paths.models import stacked
+
         each = [self._read(path, is_path=True).samples for path in paths]
         if any(one.ndim == 3 for one in each):
             if len(each) > 1:
@@ -108,14 +110,7 @@ class Files:
                 f"{option} must give a path to each of the {count} microphone(s) from every source, got {len(rows)} in all: "
                 "choose one channel of a file, as in file.wav:0, or see the order of several with kfopc verdict --help"
             )
-        longest = max(row.size for row in rows)
-        padded = np.array([np.pad(row, (0, longest - row.size)) for row in rows])
-        return padded.reshape(-1, count, longest).swapaxes(0, 1)
-
-    def _recording(self, path: str) -> Recording:
-        read = self._read(path, is_path=False)
-        self._require_new(path, len(np.atleast_2d(read.samples)))
-        return read
+        return stacked(rows).reshape(len(rows) // count, count, -1).swapaxes(0, 1)
 
     def _read(self, path: str, *, is_path: bool) -> Recording:
         """Read a file, whose rate must be that of the files before it."""
@@ -137,15 +132,18 @@ class Files:
         self._fs, self._first = read.fs, self._first or path
         rate = "" if read.file_fs in (None, read.fs) else f" resampled from {read.file_fs:g} Hz"
         what = "taps" if is_path else "samples"
+        if not is_path:
+            self._require_new(path, len(np.atleast_2d(read.samples)))
         self.read.append(f"{path}, {' x '.join(map(str, read.samples.shape))} {what} at {read.fs:g} Hz{rate}")
         return read
 
     def _chosen(self, path: str, source: str, is_path: bool, fs: float | None) -> Recording:
-        """Return the channels of a file that its argument or the options choose, at a rate."""
+        """Return the channels of a file that its argument or else the options choose, at a rate."""
         from ..paths.reading import path_of
-        from ..signals.recordings import LEAST_SURE_RATE, read_content, recording_of
+        from ..signals.recordings import LEAST_SURE_RATE, as_channel, read_content, recording_of
 
-        content, file_fs = read_content(source, variable=_named(path).variable or self.options.variable), None
+        named = _named(path)
+        content, file_fs = read_content(source, variable=named.variable or self.options.variable), None
         if content.fs is None or content.fs < LEAST_SURE_RATE:
             file_fs, self._without_rate = self.options.file_fs, True
             if file_fs is None and content.fs is None:
@@ -154,7 +152,13 @@ class Files:
                     "--file-fs 48000 (--fs is the rate to which files are resampled)"
                 )
         read = (path_of if is_path else recording_of)(source, content, fs, file_fs)
-        return _with_channel(read, path, self.options.channel)
+        channel, called, samples = named.channel, f"the channel in {path}", read.samples
+        if channel is None and samples.ndim > 1:
+            channel, called = self.options.channel, "--channel"
+        if channel is not None:
+            samples = np.atleast_2d(samples)
+            samples = samples[as_channel(channel, samples, path, called=called)]
+        return replace(read, samples=samples, name=path)
 
     def _require_new(self, path: str, n_channels: int) -> None:
         """Raise ValueError if a channel of a recording was read before: it would be compared with itself."""
@@ -168,27 +172,6 @@ class Files:
                     f"in {named.file}:0 and {named.file}:1"
                 )
             self._recorded[key] = path
-
-
-def _with_channel(read: Recording, path: str, channel: int | None) -> Recording:
-    """Return the channel that is named with a file, or else the one that is chosen for all files with several."""
-    from ..signals.recordings import as_channel
-
-    named = _named(path).channel
-    called = "--channel" if named is None else f"the channel in {path}"
-    if named is None and read.samples.ndim > 1:
-        named = channel
-    if named is None:
-        return read
-    samples = np.atleast_2d(read.samples)
-    return replace(read, samples=samples[as_channel(named, samples, path, called=called)])
-
-
-def _only_channel(read: Recording, path: str) -> np.ndarray:
-    if read.samples.size != read.samples.shape[-1]:
-        last = len(read.samples) - 1
-        raise ValueError(f"{path} has {last + 1} channels where one is needed: name one of {path}:0 to {path}:{last}")
-    return read.one_channel()
 
 
 @contextmanager
@@ -311,14 +294,12 @@ def _rating(own: argparse.Namespace) -> list[Any]:
         used |= {*OF_A_LOUDSPEAKER} - ({"ohm"} if own.impedance is not None else set())
     if not ratings:
         raise ValueError("a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6")
-    unused = [
-        f"--{name.replace('_', '-')}" for name, value in vars(own).items() if value is not None and name not in used
-    ]
-    if unused:
-        raise ValueError(
-            f"{' and '.join(unused)} would not be used: --ohm, --rating and --volts-per-unit belong to --watt, and "
-            "--impedance to --loudspeaker-watt, --programme-watt or --x-max-mm; add these, or leave it out"
-        )
+    refuse_unused(
+        own,
+        [name for name in vars(own) if name not in used],
+        ": --ohm, --rating and --volts-per-unit belong to --watt, and --impedance to --loudspeaker-watt, "
+        "--programme-watt or --x-max-mm; add these, or leave it out",
+    )
     return ratings
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
 from .._validate import as_count, as_positive
@@ -62,6 +62,13 @@ def _checked(kind: Callable[[str], Any], option: str, check: Callable[..., Any],
             raise argparse.ArgumentError(None, str(error)) from error
 
     return read
+
+
+def refuse_unused(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    """Raise ValueError, with the reason why, if one of the options that nothing would use is given."""
+    unused = [f"--{name.replace('_', '-')}" for name in names if getattr(options, name) is not None]
+    if unused:
+        raise ValueError(f"{' and '.join(unused)} would not be used{why}")
 
 
 def add_reading(

@@ -13,7 +13,7 @@ import numpy as np
 
 from .._validate import as_nonnegative
 from .inputs import Files, scene_of
-from .options import DONE, Parser, add_command, add_count, add_number, add_scene
+from .options import DONE, Parser, add_command, add_count, add_number, add_scene, refuse_unused
 from .printing import warn
 
 if TYPE_CHECKING:
@@ -105,11 +105,7 @@ def _sound_card(options: argparse.Namespace) -> Interface:
             "the inputs of a sound card; without a reference microphone, --feedback in place of --references"
         )
     of_files = ("primary", "disturbance", "secondary", "microphones", "file_fs", "channel", "variable")
-    unused = [f"--{name.replace('_', '-')}" for name in of_files if getattr(options, name) is not None]
-    if unused:
-        raise ValueError(
-            f"{' and '.join(unused)} would not be used with a sound card: leave it out, or give a recording"
-        )
+    refuse_unused(options, of_files, " with a sound card: leave it out, or give a recording")
     if set(references) & set(options.errors):
         raise ValueError("--references and --errors must be different inputs of the sound card")
     return SoundDevice(

@@ -131,9 +131,10 @@ class Recording:
         """
         if self.samples.size != self.samples.shape[-1]:
             count = math.prod(self.samples.shape[:-1])
+            name = self.name or "the recording"
             raise ValueError(
-                f"{self.name or 'the recording'} has {count} channels where one is needed: read it with channel=0 to "
-                f"channel={count - 1}"
+                f"{name} has {count} channels where one is needed: read it with channel=0 to channel={count - 1} (in a "
+                f"command, name one of {name}:0 to {name}:{count - 1})"
             )
         return self.samples.reshape(-1)
 

@@ -52,10 +52,7 @@ def test_several_channels_are_compared_each_loudspeaker_with_its_rating(command,
         noise_reduction_db(again.error, again.disturbance), abs=0.2
     )
     assert figures["MOV-FxLMS"]["output_power"] < 1.1
-    assert {path.name for path in (tmp_path / "out" / "figures").glob("*power*.svg")} >= {
-        "own-data-power-1.svg",
-        "own-data-power-2.svg",
-    }
+    assert (tmp_path / "out" / "figures" / "own-data-power.svg").is_file()
 
 
 @pytest.mark.parametrize("action", ["compare", "verdict"])
