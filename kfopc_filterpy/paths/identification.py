@@ -159,7 +159,8 @@ def estimate_path(
     sent, heard = as_real_array(excitation, "excitation"), as_real_array(response, "response")
     if heard.ndim == 3:
         taps, residual_db, variance = _fit_in_turn(sent, heard, n_taps, ridge)
-    elif sent.ndim == 2 or heard.ndim == 2:
+    else:
+        single = sent.ndim < 2 and heard.ndim < 2
         sent, heard = np.atleast_2d(as_channels(sent, "excitation")), np.atleast_2d(as_channels(heard, "response"))
         require_length(sent.shape[1], (len(sent) + 1) * n_taps - 1)
         if heard.shape[1] != sent.shape[1]:
@@ -167,13 +168,9 @@ def estimate_path(
         require_audible({"excitation": sent, "response": heard}, n_taps)
         _require_different(sent, n_taps)
         taps, residual_db, variance = _fit(sent, heard, n_taps, ridge)
-    else:
-        sent = as_signal(sent, "excitation", min_length=2 * n_taps - 1)
-        heard = as_signal(heard, "response", length=sent.size)
-        require_audible({"excitation": sent, "response": heard}, n_taps)
-        taps, residual_db, variance = _fit(sent[np.newaxis], heard[np.newaxis], n_taps, ridge)
-        only, uncertainty = taps[0, 0], relative_to(taps, variance)
-        return PathEstimate(fir_path(only, fs), only, float(residual_db[0]), uncertainty)
+        if single:
+            only, uncertainty = taps[0, 0], relative_to(taps, variance)
+            return PathEstimate(fir_path(only, fs), only, float(residual_db[0]), uncertainty)
     return PathEstimate(_system(taps, fs), taps, residual_db, relative_to(taps, variance))
 
 
@@ -181,7 +178,7 @@ def require_audible(recorded: Mapping[str, np.ndarray], n_taps: int) -> None:
     """Raise ValueError if a signal, (..., n_samples), is silent where it is fitted; the message gives its index."""
     for name, signals in recorded.items():
         for silent in np.argwhere(~np.any(signals[..., n_taps - 1 :], axis=-1)):
-            index = "".join(f"[{i}]" for i in silent)
+            index = "".join(f"[{i}]" for i in silent) if signals.size > signals.shape[-1] else ""
             raise ValueError(f"{name}{index} must not be silent: it does not reveal the path")
 
 

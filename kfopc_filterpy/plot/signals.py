@@ -15,7 +15,7 @@ from ..controllers.base import listed
 from ..loop.result import SimulationResult
 from ..metrics import SOUND_PRESSURE, coherence_and_gain, output_power, power_spectrum_db
 from .results import DISTURBANCE, RATED, Results, curves, one_channel, require_common_disturbance, span_of, span_times
-from .style import labelled, new_axes
+from .style import labelled, legend_above, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -289,7 +289,6 @@ def plot_disturbance_and_anti_noise(
     if len(shown) > 1:
         raise ValueError(f"result must be one run, got {len(shown)}")
     run = shown[0].run
-    part = span_of(run, span_s)
     low, high = as_band(band, run.fs)
     disturbance, anti_noise = one_channel(run.disturbance, channel), one_channel(run.anti_noise, channel)
     coherence, gain = coherence_and_gain(disturbance, anti_noise, run.fs, (low, high))
@@ -299,12 +298,8 @@ def plot_disturbance_and_anti_noise(
     )
     if run.rated_power is not None:
         text += f", rated power {listed(run.rated_power, 'g')}"
-    ax = new_axes(ax)
-    time = span_times(ax, run, part, span_s)
-    ax.plot(time, disturbance[part], label="Disturbance", **{**DISTURBANCE, "linewidth": 1.6})
-    line = shown[0].line()
-    ax.plot(time, anti_noise[part], **{**line, "label": f"Anti-noise, {line['label']}"})
-    return labelled(ax, text, ylabel="Sound at the error microphone")
+    named = {f"Anti-noise, {shown[0].label}": run}
+    return legend_above(plot_anti_noise(named, span_s=span_s, channel=channel, ax=ax), text)
 
 
 def _peak(signal: np.ndarray) -> float:

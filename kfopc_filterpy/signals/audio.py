@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -77,9 +77,10 @@ def _require_whole(path: str | os.PathLike[str]) -> _Bits | None:
         if kind not in _CONTAINERS or held < 12:
             return None
         order = _CONTAINERS[kind]
-        samples_end, claimed = _claimed_ends(file, order, kind in (b"RF64", b"BW64"))
+        chunks = {name: place for name, *place in reversed(list(_chunks(file, order)))}  # the first of each name
+        samples_end, claimed = _claimed_ends(file, order, chunks)
         more = samples_end and _unclaimed(file, order, samples_end)
-        spared = None if kind == b"FORM" else _spared(file, order)
+        spared = None if kind == b"FORM" else _spared(file, order, chunks)
     if claimed > held:
         raise ValueError(f"{path} is cut short: its header claims {claimed} bytes, {held} are there")
     if more:
@@ -91,23 +92,22 @@ def _require_whole(path: str | os.PathLike[str]) -> _Bits | None:
     return spared
 
 
-def _claimed_ends(file: BinaryIO, order: str, is_64_bit: bool) -> tuple[int, int]:
+def _claimed_ends(file: BinaryIO, order: str, chunks: Mapping[bytes, Sequence[int]]) -> tuple[int, int]:
     """Return where the samples end by the header's sizes, 0 if these do not say so, and where the file ends at the earliest."""
+    file.seek(4)
     (size,) = struct.unpack(f"{order}I", file.read(4))
     end = 8 + size if size not in _SIZES_UNKNOWN else 0
     wide_data = None
-    for name, start, size in _chunks(file, order):
-        if is_64_bit and name == b"ds64" and size >= 16:
-            file.seek(start)
-            wide, wide_data = struct.unpack("<QQ", file.read(16).ljust(16, b"\0"))
-            end = max(end, 8 + wide)
-        if name in (b"data", b"SSND"):
-            if size in _SIZES_UNKNOWN:
-                if wide_data is None:  # the size of the whole is then none either
-                    return 0, 0
-                size = wide_data
-            return start + size, max(end, start + size)
-    return 0, end
+    if b"ds64" in chunks and chunks[b"ds64"][1] >= 16:
+        file.seek(chunks[b"ds64"][0])
+        wide, wide_data = struct.unpack("<QQ", file.read(16).ljust(16, b"\0"))
+        end = max(end, 8 + wide)
+    start, size = chunks.get(b"data") or chunks.get(b"SSND") or (0, 0)
+    if size in _SIZES_UNKNOWN:
+        if wide_data is None:  # the size of the whole is then none either
+            return 0, 0
+        size = wide_data
+    return start + size, max(end, start + size)
 
 
 def _unclaimed(file: BinaryIO, order: str, end: int) -> int:
@@ -123,16 +123,16 @@ def _unclaimed(file: BinaryIO, order: str, end: int) -> int:
     return len(rest)
 
 
-def _spared(file: BinaryIO, order: str) -> _Bits | None:
-    for name, start, size in _chunks(file, order):
-        if name == b"fmt " and size >= 16:
-            file.seek(start)
-            head = file.read(min(size, 28)).ljust(28, b"\0")
-            tag, channels, _, _, block, bits, _, valid, _, own_tag = struct.unpack(f"{order}HHIIHHHHII", head)
-            if tag == _EXTENSIBLE:
-                tag, bits = own_tag, min(bits, valid or bits)
-            return _Bits(bits, block) if tag == _PCM and bits > 8 and 8 * block != bits * channels else None
-    return None
+def _spared(file: BinaryIO, order: str, chunks: Mapping[bytes, Sequence[int]]) -> _Bits | None:
+    start, size = chunks.get(b"fmt ", (0, 0))
+    if size < 16:
+        return None
+    file.seek(start)
+    head = file.read(min(size, 28)).ljust(28, b"\0")
+    tag, channels, _, _, block, bits, _, valid, _, own_tag = struct.unpack(f"{order}HHIIHHHHII", head)
+    if tag == _EXTENSIBLE:
+        tag, bits = own_tag, min(bits, valid or bits)
+    return _Bits(bits, block) if tag == _PCM and bits > 8 and 8 * block != bits * channels else None
 
 
 def _justified(path: str | os.PathLike[str], frames: np.ndarray, own: _Bits, n_bytes: int, n_channels: int) -> float:

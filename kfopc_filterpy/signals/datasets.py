@@ -293,32 +293,18 @@ def find_or_fetch(name: str, folder: str | os.PathLike[str] | None, *, allow_dow
 
     Only to the cache is anything fetched, if that is allowed.
     """
-    dataset = named_dataset(name)
     named = folder if folder is not None else os.environ.get(_FOLDER_VARIABLE) or None
-    if named is None:
-        if allow_download:
-            return fetch_dataset(name, timeout_s=timeout_s)
-        return _cached(dataset)
-    for file in dataset.files:
-        if not _is_published(Path(named), file):
+    if named is None and allow_download:
+        return fetch_dataset(name, timeout_s=timeout_s)
+    place = dataset_folder() if named is None else Path(named)
+    for file in named_dataset(name).files:
+        if not _is_published(place, file):
             raise DataUnavailableError(
-                f"{Path(named) / file.name} is missing: put {file.url} there with signals.fetch_dataset({name!r}, folder), or "
-                f"name another folder (argument folder, or the environment variable {_FOLDER_VARIABLE})"
+                f"{place / file.name} is missing: put {file.url} there with signals.fetch_dataset({name!r}, folder), or "
+                f"name another folder (argument folder, or the environment variable {_FOLDER_VARIABLE}); without a folder, "
+                "allow_download=True fetches it"
             )
-    return Path(named)
-
-
-def _cached(dataset: Dataset) -> Path:
-    try:
-        if has_dataset(dataset.name):
-            return dataset_folder()
-        reason = ""
-    except DataUnavailableError as error:  # pooch is not installed, or a file of the cache is damaged
-        reason = f" ({error})"
-    raise DataUnavailableError(
-        f"no folder with the measured {dataset.name} is named, and none is in the cache{reason}: pass folder, set "
-        f"{_FOLDER_VARIABLE}, or pass allow_download=True to fetch it from its public sources"
-    )
+    return place
 
 
 def _is_published(folder: Path, file: DatasetFile) -> bool:

@@ -113,9 +113,8 @@ def load_measured_duct(
     run the built-in duct instead
     """
     as_choice(noise, "noise", _NOISES)
-    timeout = as_positive(timeout_s, "timeout_s", unit="s")
-    paths = _vectors("duct", folder, allow_download, timeout)
-    (recorded,) = _vectors(noise, folder, allow_download, timeout).values()
+    paths = _vectors("duct", folder, allow_download, timeout_s)
+    (recorded,) = _vectors(noise, folder, allow_download, timeout_s).values()
     return MeasuredDuct(primary=paths["Pz1"], secondary=paths["S"], noise=recorded)
 
 
@@ -210,8 +209,7 @@ def load_measured_room(
     ...     print("compute a room with room_paths instead")
     compute a room with room_paths instead
     """
-    timeout = as_positive(timeout_s, "timeout_s", unit="s")
-    paths = _vectors("room", folder, allow_download, timeout)
+    paths = _vectors("room", folder, allow_download, timeout_s)
     each = range(1, 5)
     return MeasuredRoom(
         primary=np.array([[paths[f"P{k}"]] for k in each]),
@@ -225,7 +223,8 @@ def _vectors(
     """Return the vectors of a dataset, by variable. Its files are the published ones, so no process is needed."""
     from scipy.io import loadmat
 
-    place = find_or_fetch(name, folder, allow_download=allow_download, timeout_s=timeout_s)
+    timeout = as_positive(timeout_s, "timeout_s", unit="s")
+    place = find_or_fetch(name, folder, allow_download=allow_download, timeout_s=timeout)
     return {
         file.variable: np.ravel(loadmat(place / file.name, variable_names=[file.variable])[file.variable])
         for file in named_dataset(name).files

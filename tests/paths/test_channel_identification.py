@@ -160,7 +160,7 @@ NOISES = np.random.default_rng(0).standard_normal((3, 100))
         (NOISES[0], np.full((2, 2, 100), np.nan), r"response must be finite"),
         (NOISES[0], NOISES.T[np.newaxis], "response must have its channels first"),
         (NOISES[0], np.zeros((0, 2, 100)), r"response must be \(J loudspeakers, K microphones, n_samples\), got shape"),
-        (NOISES[0], np.zeros((1, 1, 1, 100)), "response must be one-dimensional"),
+        (NOISES[0], np.zeros((1, 1, 1, 100)), "response must be .n_samples,. or"),
     ],
 )
 def test_estimate_refuses(sent, heard, message):

@@ -131,7 +131,7 @@ def test_identification_refuses(changes, message):
 @pytest.mark.parametrize(
     ("sent", "heard", "message"),
     [
-        (np.ones(10), np.ones(9), "response must have 10 values"),
+        (np.ones(10), np.ones(9), "response must have 10 samples"),
         (np.ones(4), np.ones(4), "excitation must have at least 7"),
         (np.zeros(10), np.ones(10), "excitation must not be silent"),
         (np.ones(10), np.zeros(10), "response must not be silent"),
