@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from ..signals import Recording
 
 STANDARD_INPUT = "-"
+LONG_PATH_S = 5.0  # hardly any impulse response is longer
+LONGEST_PATH_S, MOST_TAPS = 10.0, 65536  # of an impulse response
 
 
 class _Named(NamedTuple):
@@ -55,7 +57,6 @@ class Files:
         self._fs = 0.0  # of the files that were read; 0 before the first
         self._first = ""
         self._without_rate = False  # whether a file stated none
-        self._recorded: dict[tuple[Any, ...], str] = {}  # channels of recordings, and the arguments that named them
 
     @property
     def fs(self) -> float:
@@ -87,10 +88,16 @@ class Files:
 
     def noise_paths(self, paths: Sequence[str], option: str, noise: np.ndarray) -> np.ndarray:
         """Return a matrix of paths for a noise; they must be shorter than it, and not silent."""
-        from ..paths.file_checks import require_shorter, require_sound
+        from ..paths.file_checks import require_sound
 
         matrix = self.matrix(paths, option, self.options.microphones)
-        require_shorter(", ".join(paths), matrix.shape[-1], self.options.noise, noise.shape[-1], self._fs)
+        n_taps, n_samples = matrix.shape[-1], noise.shape[-1]
+        if n_taps >= n_samples or n_taps > min(LONGEST_PATH_S * self._fs, MOST_TAPS):
+            raise ValueError(
+                f"{', '.join(paths)} has {n_taps} samples ({n_taps / self._fs:.3g} s), {self.options.noise} {n_samples} "
+                f"({n_samples / self._fs:.3g} s): an impulse response must be shorter than the noise, and at most "
+                f"{LONGEST_PATH_S:g} s and {MOST_TAPS} taps long; cut the impulse response, or are the files swapped?"
+            )
         require_sound(paths[0] if len(paths) == 1 else option, matrix)
         return matrix
 
@@ -114,7 +121,6 @@ class Files:
 
     def _read(self, path: str, *, is_path: bool) -> Recording:
         """Read a file, whose rate must be that of the files before it."""
-        from ..paths.file_checks import LONG_PATH_S
         from ..signals.quality import clipping_remarks
 
         with _file(path) as source:
@@ -132,8 +138,6 @@ class Files:
         self._fs, self._first = read.fs, self._first or path
         rate = "" if read.file_fs in (None, read.fs) else f" resampled from {read.file_fs:g} Hz"
         what = "taps" if is_path else "samples"
-        if not is_path:
-            self._require_new(path, len(np.atleast_2d(read.samples)))
         self.read.append(f"{path}, {' x '.join(map(str, read.samples.shape))} {what} at {read.fs:g} Hz{rate}")
         return read
 
@@ -160,19 +164,6 @@ class Files:
             samples = samples[as_channel(channel, samples, path, called=called)]
         return replace(read, samples=samples, name=path)
 
-    def _require_new(self, path: str, n_channels: int) -> None:
-        """Raise ValueError if a channel of a recording was read before: it would be compared with itself."""
-        named = _named(path)
-        channel = self.options.channel if named.channel is None else named.channel
-        for own in range(n_channels) if channel is None else (channel,):
-            key = (Path(named.file).resolve(), named.variable, own)
-            if key in self._recorded:
-                raise ValueError(
-                    f"{self._recorded[key]} and {path} are the same channel of one recording: name the channel of each, as "
-                    f"in {named.file}:0 and {named.file}:1"
-                )
-            self._recorded[key] = path
-
 
 @contextmanager
 def _file(path: str) -> Iterator[str]:
@@ -192,7 +183,7 @@ def _file(path: str) -> Iterator[str]:
 
 def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, Any]:
     """Return noise, primary path, secondary path and disturbance, each with its channels."""
-    from ..paths.file_checks import require_different, require_same_length
+    from ..paths.file_checks import require_different
 
     if options.secondary is None:
         raise ValueError("--secondary is needed: the impulse response from control signal to error microphone")
@@ -216,7 +207,11 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, 
         )
     if options.disturbance is not None:
         disturbance = files.channels(options.disturbance)
-        require_same_length(options.disturbance, disturbance.shape[-1], options.noise, noise.shape[-1])
+        if disturbance.shape[-1] != noise.shape[-1]:
+            raise ValueError(
+                f"{options.disturbance} has {disturbance.shape[-1]} samples, {options.noise} {noise.shape[-1]}: they must be "
+                "recorded together and be equally long; cut both to the same start and the same end"
+            )
         require_different(options.disturbance, disturbance, options.noise, noise)
         if len(disturbance) != len(secondary):
             raise ValueError(

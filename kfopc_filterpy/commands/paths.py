@@ -65,10 +65,12 @@ def _add_written(parser: Any) -> None:
 def identify(options: argparse.Namespace) -> int:
     """Fit an impulse response, write it and print what it leaves unexplained."""
     from ..paths import estimate_path
+    from ..paths.file_checks import require_different
 
     _require_output(options.output)
     files = Files(options)
     sent, heard = files.recording(options.excitation), files.recording(options.response)
+    require_different(options.response, heard[np.newaxis], options.excitation, sent[np.newaxis])
     shortest = min(sent.size, heard.size)  # a recorder is stopped later than the player
     if options.taps > (shortest + 1) // 2 > 0:
         raise ValueError(

@@ -106,8 +106,6 @@ def _sound_card(options: argparse.Namespace) -> Interface:
         )
     of_files = ("primary", "disturbance", "secondary", "microphones", "file_fs", "channel", "variable")
     refuse_unused(options, of_files, " with a sound card: leave it out, or give a recording")
-    if set(references) & set(options.errors):
-        raise ValueError("--references and --errors must be different inputs of the sound card")
     return SoundDevice(
         references,
         options.errors,
@@ -127,8 +125,6 @@ def _simulated(options: argparse.Namespace) -> SimulatedInterface:
         )
     if options.primary is not None and options.disturbance is not None:
         raise ValueError("--disturbance stands in place of --primary: leave out one of them")
-    if options.latency is not None and options.latency < options.block:
-        raise ValueError(f"--latency must be at least a block, {options.block} samples, got {options.latency}")
     files = Files(options)
     noise, primary, secondary, disturbance = scene_of(options, files)
     _judge_length(options, noise.shape[-1] / files.fs)

@@ -1,34 +1,8 @@
-"""Checks of files that are to go together: impulse responses with a noise, recordings with each other."""
+"""Checks of recordings and impulse responses, which messages call by their files or arguments."""
 
 from __future__ import annotations
 
 import numpy as np
-
-LONG_PATH_S = 5.0  # hardly any impulse response is longer
-LONGEST_PATH_S, MOST_TAPS = 10.0, 65536  # of an impulse response
-
-
-def require_shorter(path: str, n_taps: int, noise: str, n_samples: int, fs: float) -> None:
-    """Raise ValueError if an impulse response is not shorter than the noise, or too long for any.
-
-    `path` and `noise` are the names of the files.
-    """
-    if n_taps < n_samples and n_taps <= min(LONGEST_PATH_S * fs, MOST_TAPS):
-        return
-    raise ValueError(
-        f"{path} has {n_taps} samples ({n_taps / fs:.3g} s), {noise} {n_samples} ({n_samples / fs:.3g} s): an impulse "
-        f"response must be shorter than the noise, and at most {LONGEST_PATH_S:g} s and {MOST_TAPS} taps long; cut the "
-        "impulse response, or are the files swapped?"
-    )
-
-
-def require_same_length(disturbance: str, n_samples: int, noise: str, expected: int) -> None:
-    """Raise ValueError if two recordings that were made together differ in length; they are named by their files."""
-    if n_samples != expected:
-        raise ValueError(
-            f"{disturbance} has {n_samples} samples, {noise} {expected}: they must be recorded together and be equally "
-            f"long; cut both to the same start and the same end"
-        )
 
 
 def require_different(disturbance: str, heard: np.ndarray, noise: str, reference: np.ndarray) -> None:

@@ -81,7 +81,7 @@ class SoundDevice:
         self._errors = _indices(error_channels, "error_channels")
         self._outputs = _indices(output_channels, "output_channels")
         if set(self._references) & set(self._errors):
-            raise ValueError("reference_channels and error_channels must be different inputs")
+            raise ValueError("references and errors must be different inputs of the sound card")
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.block = as_count(block, "block")
         self.device, self.latency = device, latency

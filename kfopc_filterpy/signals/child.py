@@ -64,11 +64,11 @@ def read_in_child(
 
 def serve(library: str, function: tuple[str, str], arguments: list[str], limit_s: float) -> None:
     """Write what a function returns, or its error, to the standard output: a line of JSON, then the samples."""
-    faulthandler.dump_traceback_later(limit_s, exit=True)  # also if a library never returns
     module, name = function
     try:
         read = getattr(import_module(module), name)
-        import_module(library)  # which takes its own memory first
+        import_module(library)  # which takes time and memory of its own
+        faulthandler.dump_traceback_later(limit_s, exit=True)  # also if a library never returns
         _limit_memory(3 * room_of(arguments[0]))
         content: Content = read(*arguments)
         samples = np.ascontiguousarray(content.samples, dtype=np.float64)

@@ -31,7 +31,7 @@ def test_a_fraction_is_a_fraction():
         ("q = 2.5e+06.", "q = 2.5 × 10<sup>6</sup>."),
         ("file1e5 and 0x1e5a", "file1e5 and 0x1e5a"),
         ("up to sqrt(2 rated power);", f"up to {mathml(FORMULAS['sqrt(2 rated power)'])};"),
-        ("KF-ANC's r E[x'^2]/q", f"KF-ANC&#39;s {mathml(STATE_NOISE)}"),
+        ("KF-ANC's r E[x'^2]/q", f"KF-ANC's {mathml(STATE_NOISE)}"),
         ("", ""),
     ],
     ids=["escaped", "power", "factor", "words", "formula", "longest", "empty"],

@@ -235,7 +235,7 @@ def test_a_table_on_the_page(tmp_path):
     rows = [re.findall(r'<t[hd][^>]* class="(\w+)">(.*?)</t[hd]>', row) for row in table.split("<tr>")[1:]]
     assert [[text for _, text in row] for row in rows] == [
         ["paths", "noise, of &lt;kind&gt;", "power"],
-        ["duct", "tone &#34;300&#34;", "0.1235"],
+        ["duct", 'tone "300"', "0.1235"],
         ["band-pass", "diverged", "10<sup>6</sup>"],
         ["duct", "7", "3"],
     ]

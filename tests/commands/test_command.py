@@ -172,11 +172,11 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
         (["paths", "convert", "S.wav:S", "x.npy"], "S.wav is an audio file, which has no named variables"),
         (
             ["paths", "identify", "stereo.wav", "stereo.wav", "--channel", "0", "--taps", "8", "-o", "x.npy"],
-            "stereo.wav and stereo.wav are the same channel of one recording: name the channel of each, as in stereo.wav:0",
+            "channel 0 of stereo.wav is channel 0 of stereo.wav, sample for sample: is it the error microphone? Name its channel",
         ),
         (
             ["verdict", "stereo.wav", "--disturbance", "./stereo.wav:1", "--secondary", "S.wav", "--rated-power", "1"],
-            "stereo.wav and ./stereo.wav:1 are the same channel",
+            "channel 0 of ./stereo.wav:1 is channel 1 of stereo.wav, sample for sample",
         ),
         (["compare", *SCENE, "--rated-power", "1", "--seconds", "0"], "--seconds must be greater than 0 s, got 0"),
         (["explore", "--port", "-1"], "--port must be at least 0, got -1"),
