@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,7 @@ from .study_report import SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Sound, Study
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from .assessment import Assessment
+    from .assessment import Assessment, SoundLevels
 
 TEMPLATE = "verdict.html.jinja"
 NEEDED = ("jinja2", "latex2mathml", "matplotlib", "PIL")
@@ -55,7 +56,7 @@ def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Pat
         {},
         figures=list(_figures(verdict)),
         tables=list(_tables(verdict)),
-        sounds=_sounds(verdict),
+        sounds=list(run_sounds(verdict.runs, verdict.algorithm)),
     )
     write_files(study, path)
     write_whole(path / "verdict.json", verdict.json + "\n")
@@ -89,13 +90,9 @@ def _figures(verdict: Assessment) -> Iterator[FigureItem]:
         together="" if verdict.channels is None else " All microphones together.",
         pascal_per_unit=verdict.pascal_per_unit,
     )
-    if (levels := verdict.levels) is not None:
-        pairs = np.atleast_2d(levels.before_db), np.atleast_2d(levels.after_db)
-
-        def bands(k: int, ax: Any) -> None:
-            _draw_bands(levels.centres_hz, pairs[0][k], pairs[1][k], ax)
-
-        figure = _one_below_another(len(pairs[0]), "Microphone", (9, 3.6), bands)
+    if verdict.levels is not None:
+        n_microphones = len(np.atleast_2d(verdict.levels.before_db))
+        figure = _one_below_another(n_microphones, "Microphone", (9, 3.6), partial(_draw_bands, verdict.levels))
         yield FigureItem("third-octaves", f"Third-octave bands without control and with {verdict.algorithm}.", figure)
 
 
@@ -174,8 +171,10 @@ def _bound(verdict: Assessment) -> Any:
     return ax
 
 
-def _draw_bands(centres_hz: np.ndarray, before_db: np.ndarray, after_db: np.ndarray, ax: Any) -> None:
-    """Draw third-octave levels without and with control, from 60 dB below the loudest on."""
+def _draw_bands(levels: SoundLevels, microphone: int, ax: Any) -> None:
+    """Draw a microphone's third-octave levels without and with control, from 60 dB below the loudest on."""
+    centres_hz = levels.centres_hz
+    before_db, after_db = (np.atleast_2d(own)[microphone] for own in (levels.before_db, levels.after_db))
     floor = max(np.max(before_db), np.max(after_db)) - 60
     places = np.arange(centres_hz.size)
     for offset, values, label, colour in (
@@ -196,20 +195,18 @@ def _nominal(centre: float) -> str:
     return f"{digits * 10 ** np.floor(np.log10(centre) + 1e-6):g}"
 
 
-def _sounds(verdict: Assessment) -> list[Sound]:
-    """Return the sounds without control and of each algorithm, of the steady half, at each microphone."""
-    run = verdict.runs[verdict.algorithm]
-    settled = 0.5 * run.n_samples / verdict.fs
-    sounds = []
-    for k, disturbance in enumerate(np.atleast_2d(run.disturbance)):
-        several = verdict.channels is not None
-        group = f"at microphone {k + 1}" if several else "at the error microphone"
-        end = f"-{k + 1}" if several else ""
-        sounds.append(Sound(f"before{end}", "Without control", disturbance, group, settled))
-        for name, own in verdict.runs.items():
-            stem = "after" if name == verdict.algorithm else name.lower()
-            sounds.append(Sound(f"{stem}{end}", name, np.atleast_2d(own.error)[k], group, settled))
-    return sounds
+def run_sounds(runs: Mapping[str, SimulationResult], own: str = "") -> Iterator[Sound]:
+    """Yield the sounds without control and of each run, from the steady half on, at each microphone; `own` is "after"."""
+    first = next(iter(runs.values()))
+    settled = 0.5 * first.n_samples / first.fs
+    for k, disturbance in enumerate(np.atleast_2d(first.disturbance)):
+        group, end = "at the error microphone", ""
+        if first.disturbance.ndim > 1:
+            group, end = f"at microphone {k + 1}", f"-{k + 1}"
+        yield Sound(f"before{end}", "Without control", disturbance, group, settled)
+        for name, run in runs.items():
+            stem = "after" if name == own else name.lower().replace(" ", "-")
+            yield Sound(f"{stem}{end}", name, np.atleast_2d(run.error)[k], group, settled)
 
 
 def _tables(verdict: Assessment) -> Any:
@@ -246,24 +243,16 @@ def _tables(verdict: Assessment) -> Any:
                 for name, own in verdict.figures.items()
             ],
         )
-    if verdict.levels is not None:
-        yield Table("levels", "Third-octave bands", *_level_rows(verdict))
-
-
-def _level_rows(verdict: Assessment) -> tuple[list[str], list[list[str | float]]]:
-    """Return the headings and rows of the third-octave bands, of all microphones."""
-    levels = verdict.levels
-    assert levels is not None
-    headings = ["Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"]
-    pairs = zip(np.atleast_2d(levels.before_db), np.atleast_2d(levels.after_db), strict=True)
-    rows: list[list[str | float]] = [
-        [str(k), _nominal(centre), float(before), float(after), float(before - after)]
-        for k, (before_db, after_db) in enumerate(pairs, 1)
-        for centre, before, after in zip(levels.centres_hz, before_db, after_db, strict=True)
-    ]
-    if verdict.channels is None:  # there is one microphone only
-        return headings, [row[1:] for row in rows]
-    return ["Microphone", *headings], rows
+    if (levels := verdict.levels) is not None:
+        headings = ["Microphone", "Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"]
+        pairs = zip(np.atleast_2d(levels.before_db), np.atleast_2d(levels.after_db), strict=True)
+        rows = [
+            [str(k), _nominal(centre), float(before), float(after), float(before - after)]
+            for k, (before_db, after_db) in enumerate(pairs, 1)
+            for centre, before, after in zip(levels.centres_hz, before_db, after_db, strict=True)
+        ]
+        left_out = 1 if verdict.channels is None else 0  # one microphone needs no number
+        yield Table("levels", "Third-octave bands", headings[left_out:], [row[left_out:] for row in rows])
 
 
 def _number(value: Any, scale: Any = None) -> Any:
@@ -287,14 +276,13 @@ def _checks(verdict: Assessment) -> dict[str, str]:
     """Return what was checked, and what was found, in words."""
     band, limits, late = verdict.band, verdict.limits, verdict.causality_margin_s
     decided = [limits.decided_by] if isinstance(limits.decided_by, str) else dict.fromkeys(limits.decided_by)
-    peak = "no peak limit" if limits.amplitude_limit is None else _peak_limits(verdict)
     causality, least = "unknown without a primary path", f"Least power for {verdict.want_db:g} dB"
     if verdict.feedback:
         causality = "the error microphone hears each control signal only after the delay of the secondary path"
     elif late is not None:
         causality = f"the anti-noise is {abs(1e3 * late):.2g} ms {'early' if late >= 0 else 'late'}"
     checks = {
-        "Rating": f"{verdict.power(limits.rated_power)}, decided by the {', '.join(decided)}; {peak}; "
+        "Rating": f"{verdict.power(limits.rated_power)}, decided by the {', '.join(decided)}; {_peak_limits(verdict)}; "
         f"windows of {limits.window_s:g} s",
         "Power for full control": verdict.power(verdict.unlimited_power),
         f"{least}, best fixed filter": _or_none(verdict, verdict.required_rated_power),
@@ -316,6 +304,8 @@ def _checks(verdict: Assessment) -> dict[str, str]:
 def _peak_limits(verdict: Assessment) -> str:
     """Return the peak limits in words."""
     limits: Any = verdict.limits.amplitude_limit
+    if limits is None:
+        return "no peak limit"
     if verdict.channels is None:
         in_volts = verdict.volts_per_unit is not None
         return f"peak limit {_number(limits, verdict.volts_per_unit):.3g}{' V' if in_volts else ''}"

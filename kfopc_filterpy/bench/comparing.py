@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from kfopc_filterpy import SimulationResult, output_power, suggest_settings
@@ -16,12 +15,12 @@ from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 from .._types import PathModels, ProgressBar
 from .assessed_runs import recorded_scene
 from .assessing import recorded_signals, switch_on_sample
-from .assessment_page import run_figures
+from .assessment_page import run_figures, run_sounds
 from .fixed_filters import longest_filter
 from .limits import ChannelLimits, Ratings, limits_of, ratings_of_each, watt_per_power
 from .registry import REGISTRY, algorithms
 from .scene import Runs, Scene, figures_of_merit, one_blas_thread, reachable_solution, reachable_weights
-from .study_report import Parameter, Sound, StudyReport, Table
+from .study_report import Parameter, StudyReport, Table
 from .tuning import RULE, AllDivergedError, run_setting, tune
 
 OF_ONE_CHANNEL = ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS")
@@ -134,11 +133,6 @@ def compare_recordings(
             notes.append(_edge(name, tuned.setting))
     if not results:
         raise ValueError(f"every algorithm diverged: {' '.join(notes)} Check the secondary path, and its sign")
-    first = next(iter(results.values()))
-    settled, where = first.n_samples / fs / 2, "at the first error microphone" if several else "at the error microphone"
-    sounds = [Sound("before", "Without control", np.atleast_2d(first.disturbance)[0], where, settled)]
-    for name, result in results.items():
-        sounds.append(Sound(name.lower().translate(_FILE), name, np.atleast_2d(result.error)[0], where, settled))
     return StudyReport(
         "own-data",
         "Your recordings",
@@ -151,7 +145,7 @@ def compare_recordings(
         {"n_taps": Parameter(settings.n_taps, settings.reasons["n_taps"]), **parameters},
         {name: figures_of_merit([result], scene) for name, result in results.items()},
         figures=list(run_figures(results, limits.rated_power, watts, start / fs)),
-        sounds=sounds,
+        sounds=list(run_sounds(results)),
         notes=[*notes, *remarks],
         tables=[_power_table(results, scene)] if several else [],
         watt_per_power=None if several else watts,
@@ -193,6 +187,3 @@ def _clipping(limit: Any) -> str:
 def _powers(rated_powers: Any, watts: Any) -> str:
     """Return rated powers in words, in W if that is known."""
     return listed(rated_powers, ".3g") if watts is None else f"{listed(rated_powers * watts, '.3g')} W"
-
-
-_FILE = str.maketrans({" ": "-", "(": None, ")": None})
