@@ -64,12 +64,12 @@ class AcousticSetup:
     def __post_init__(self) -> None:
         fs = as_positive(self.fs, "fs", unit="Hz")
         object.__setattr__(self, "fs", fs)
-        for name in ("primary", "secondary", "noise"):
-            if (signal := getattr(self, name)) is not None or name != "noise":
-                sampling_rate(signal, fs, name=name)
-                object.__setattr__(self, name, as_signal(signal, name))
-        if (noise := self.noise) is None:
+        for name in ("primary", "secondary") if self.noise is None else ("primary", "secondary", "noise"):
+            sampling_rate(getattr(self, name), fs, name=name)
+            object.__setattr__(self, name, as_signal(getattr(self, name), name))
+        if self.noise is None:
             return
+        noise = self.noise
         if noise.size < SHORTEST_S * fs:
             raise ValueError(f"noise must last {SHORTEST_S:g} s at least, got {noise.size / fs:.3g} s: record longer")
         if not np.any(noise[: int(DURATION_S * fs)]):

@@ -1,7 +1,7 @@
 """Reads a file in a process of its own, whose time and memory are limited, because a damaged file can hang a library.
 
 If a few bytes of a file are changed, libhdf5 can loop for ever, and scipy's reader of MATLAB files can end the process;
-both can take gigabytes. Nothing within the process can stop that. Another one costs 0.2 s. Its memory can be limited on
+both can take gigabytes. Nothing within the process can stop that. Another one costs 0.3 s. Its memory can be limited on
 Linux only.
 """
 

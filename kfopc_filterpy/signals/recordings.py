@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,35 +37,41 @@ _LEAST_TONE_SHARE = 0.9  # of the power of a calibrator's recording
 _LARGEST_DRIFT_DB = 0.5
 LEAST_SURE_RATE = 300.0  # Hz; kHz that stand for Hz, or ms for s, give less: recorders sample at up to 262 kHz
 
-# What a reader is called in messages, and the reader: of a path and a variable, or of a path only.
-_NAMED = {"a MAT file": read_mat, "a .npz file": read_npz}
-_UNNAMED = {
-    "an audio file": read_audio,
-    "a .npy file": read_npy,
-    "text": read_text,
-    "a UFF file": read_uff,
-    "a SOFA file": read_sofa,
-}
-_SUFFIXES = {
-    **dict.fromkeys((".wav", ".wave", ".bwf", ".rf64", ".flac", ".aif", ".aiff", ".aifc"), "an audio file"),
-    # What is refused, with the remedy.
-    **dict.fromkeys((".m4a", ".aac", ".mp3", ".ogg", ".oga", ".opus", ".wma", ".w64", ".caf", ".au"), "an audio file"),
-    **dict.fromkeys((".txt", ".csv", ".tsv", ".dat", ".asc", ".lvm", ".frd", ".zma"), "text"),
-    **dict.fromkeys((".uff", ".unv", ".uf", ".58"), "a UFF file"),
-    ".mat": "a MAT file",
-    ".npy": "a .npy file",
-    ".npz": "a .npz file",
-    ".sofa": "a SOFA file",
-}
-# A file whose suffix says nothing is known by how it begins.
-_BEGINNINGS = {
-    b"\x93NUMPY": "a .npy file",
-    b"PK\x03\x04": "a .npz file",
-    b"MATLAB": "a MAT file",
-    b"\x89HDF": "a SOFA file",
-    **dict.fromkeys((b"RIFF", b"RIFX", b"RF64", b"BW64", b"FORM", b"fLaC"), "an audio file"),
-    **dict.fromkeys((b"OggS", b"ID3", b"\xff\xfb", b"riff", b"caff", b".snd"), "an audio file"),
-}
+
+class _Format(NamedTuple):
+    """A file format: its name in messages and its reader, which takes a path, and a variable if files have named ones."""
+
+    name: str
+    read: Callable[..., Content]
+    suffixes: tuple[str, ...]
+    beginnings: tuple[bytes, ...] = ()  # by which a file is known whose suffix says nothing
+    has_variables: bool = False
+
+
+_AUDIO_FILES = (".wav", ".wave", ".bwf", ".rf64", ".flac", ".aif", ".aiff", ".aifc")
+_REFUSED_AUDIO = (".m4a", ".aac", ".mp3", ".ogg", ".oga", ".opus", ".wma", ".w64", ".caf", ".au")  # with the remedy
+_AUDIO_HEADS = (
+    b"RIFF",
+    b"RIFX",
+    b"RF64",
+    b"BW64",
+    b"FORM",
+    b"fLaC",
+    b"OggS",
+    b"ID3",
+    b"\xff\xfb",
+    b"riff",
+    b"caff",
+    b".snd",
+)
+_AUDIO = _Format("an audio file", read_audio, _AUDIO_FILES + _REFUSED_AUDIO, _AUDIO_HEADS)
+_MAT = _Format("a MAT file", read_mat, (".mat",), (b"MATLAB",), has_variables=True)
+_UFF = _Format("a UFF file", read_uff, (".uff", ".unv", ".uf", ".58"))
+_SOFA = _Format("a SOFA file", read_sofa, (".sofa",), (b"\x89HDF",))
+_TEXT = _Format("text", read_text, (".txt", ".csv", ".tsv", ".dat", ".asc", ".lvm", ".frd", ".zma"))
+_NPY = _Format("a .npy file", read_npy, (".npy",), (b"\x93NUMPY",))
+_NPZ = _Format("a .npz file", read_npz, (".npz",), (b"PK\x03\x04",), has_variables=True)
+_FORMATS = (_AUDIO, _MAT, _UFF, _SOFA, _TEXT, _NPY, _NPZ)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -333,18 +340,15 @@ def _tone_share(signal: np.ndarray) -> float:
 def read_content(path: str | os.PathLike[str], *, channel: int | None = None, variable: str | None = None) -> Content:
     """Return what a file holds as finite float64, with time as the last axis, or the channel chosen."""
     require_file(path)
-    kind = _SUFFIXES.get(Path(path).suffix.lower()) or _kind_of(path)
-    if variable is not None and kind not in _NAMED:
-        raise ValueError(f"{path} is {kind}, which has no named variables: leave out the option variable")
-    with reading(path, kind):
-        content = _NAMED[kind](path, variable) if kind in _NAMED else _UNNAMED[kind](path)
+    suffix = Path(path).suffix.lower()
+    kind = next((one for one in _FORMATS if suffix in one.suffixes), None) or _format_of(path)
+    if variable is not None and not kind.has_variables:
+        raise ValueError(f"{path} is {kind.name}, which has no named variables: leave out the option variable")
+    with reading(path, kind.name):
+        content = kind.read(path, variable) if kind.has_variables else kind.read(path)
     if content.fs is not None:
         as_rate(content.fs, f"the rate that {path} states")
-    if (
-        content.samples.ndim == 3
-        and kind != "a SOFA file"
-        and max(content.samples.shape[:2]) >= content.samples.shape[2]
-    ):
+    if content.samples.ndim == 3 and kind is not _SOFA and max(content.samples.shape[:2]) >= content.samples.shape[2]:
         raise ValueError(
             f"{path} has the shape {content.samples.shape}, expected (microphones, loudspeakers, taps) with the taps last: "
             "which axis is which? Store it in that order; (taps, microphones, loudspeakers) becomes it with MATLAB's "
@@ -367,20 +371,20 @@ def as_channel(channel: int, samples: np.ndarray, name: object, *, called: str =
     return index
 
 
-def _kind_of(path: str | os.PathLike[str]) -> str:
+def _format_of(path: str | os.PathLike[str]) -> _Format:
+    """Return the format of a file whose suffix says nothing, by how it begins."""
     with open(path, "rb") as file:
         head = file.read(600)
-    for beginning, kind in _BEGINNINGS.items():
-        if head.startswith(beginning):
+    for kind in _FORMATS:
+        if head.startswith(kind.beginnings):
             return kind
     if head[4:8] == b"ftyp":  # MPEG-4
-        return "an audio file"
+        return _AUDIO
     if head[512:516] == b"\x89HDF":
-        return "a MAT file"
+        return _MAT
     lines = head.split(b"\n", 2)
-    if lines[0].rstrip() == b"    -1" and len(lines) > 1 and lines[1].startswith(b"    58"):
-        return "a UFF file"
-    return "text"
+    is_uff = lines[0].rstrip() == b"    -1" and len(lines) > 1 and lines[1].startswith(b"    58")
+    return _UFF if is_uff else _TEXT
 
 
 def rates_of(
