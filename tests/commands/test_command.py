@@ -176,7 +176,7 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
         ),
         (
             ["verdict", "stereo.wav", "--disturbance", "./stereo.wav:1", "--secondary", "S.wav", "--rated-power", "1"],
-            "channel 0 of ./stereo.wav:1 is channel 1 of stereo.wav, sample for sample",
+            "channel 0 of ./stereo.wav:1 is channel 0 of stereo.wav, sample for sample",
         ),
         (["compare", *SCENE, "--rated-power", "1", "--seconds", "0"], "--seconds must be greater than 0 s, got 0"),
         (["explore", "--port", "-1"], "--port must be at least 0, got -1"),
