@@ -277,51 +277,39 @@ class Assessment:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict in strict JSON's types, as `verdict.schema.json` describes it."""
-        counts = ("references", "loudspeakers", "microphones")
-        return jsonable(
-            {
-                "schema_version": SCHEMA_VERSION,
-                "enough": self.enough,
-                "verdict": self.verdict,
-                "limited_by": self.limited_by,
-                "reason": self.reason,
-                "advice": self.advice,
-                "notes": self.notes,
-                "want_db": self.want_db,
-                "noise_reduction_db": self.noise_reduction_db,
-                "algorithm": self.algorithm,
-                "rating": {
-                    "rated_power": self.limits.rated_power,
-                    "amplitude_limit": self.limits.amplitude_limit,
-                    "window_s": self.limits.window_s,
-                    "decided_by": self.limits.decided_by,
-                    "volts_per_unit": self.volts_per_unit,
-                    "ohm": self.ohm,
-                },
-                "ceilings": vars(self.ceilings),
-                "bound_db": self.bound_db,
-                "unlimited_power": self.unlimited_power,
-                "required_rated_power": self.required_rated_power,
-                "least_rated_power": self.least_rated_power,
-                "causality_margin_s": self.causality_margin_s,
-                "helpful_delay_s": self.helpful_delay_s,
-                "band": vars(self.band),
-                "levels": self.levels and vars(self.levels),
-                "excursion_mm": self.excursion_mm,
-                "settings": {"n_taps": self.settings.n_taps, **self.settings.settings},
-                "algorithms": self.figures,
-                "fs": self.fs,
-                "version": __version__,
-                "origin": self.origin,
-            }
-            | ({"channels": dict(zip(counts, self.channels, strict=True))} if self.channels else {})
-            | (
-                {"loop": {name: value for name, value in vars(self.loop).items() if name not in ("paths", "fs")}}
-                if self.loop
-                else {}
+        same = (
+            *(
+                "enough",
+                "verdict",
+                "limited_by",
+                "reason",
+                "advice",
+                "notes",
+                "want_db",
+                "noise_reduction_db",
+                "algorithm",
             ),
-            "verdict",
+            *("bound_db", "unlimited_power", "required_rated_power", "least_rated_power", "causality_margin_s"),
+            *("helpful_delay_s", "excursion_mm", "fs", "origin"),
         )
+        rating = {
+            name: getattr(self.limits, name) for name in ("rated_power", "amplitude_limit", "window_s", "decided_by")
+        }
+        told = {"schema_version": SCHEMA_VERSION} | {name: getattr(self, name) for name in same}
+        told |= {
+            "rating": rating | {"volts_per_unit": self.volts_per_unit, "ohm": self.ohm},
+            "ceilings": vars(self.ceilings),
+            "band": vars(self.band),
+            "levels": self.levels and vars(self.levels),
+            "settings": {"n_taps": self.settings.n_taps, **self.settings.settings},
+            "algorithms": self.figures,
+            "version": __version__,
+        }
+        if self.channels:
+            told["channels"] = dict(zip(("references", "loudspeakers", "microphones"), self.channels, strict=True))
+        if self.loop:
+            told["loop"] = {name: value for name, value in vars(self.loop).items() if name not in ("paths", "fs")}
+        return jsonable(told, "verdict")
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """Write verdict.html, verdict.json, figures and sounds into a `folder`, and return the path of the page.

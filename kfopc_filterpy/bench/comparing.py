@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from kfopc_filterpy import SimulationResult, output_power, suggest_settings
+from kfopc_filterpy import output_power, suggest_settings
 from kfopc_filterpy._validate import as_choice, as_count, as_positive
 from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
@@ -19,7 +19,7 @@ from .assessment_page import run_figures, run_sounds
 from .fixed_filters import longest_filter
 from .limits import ChannelLimits, Ratings, limits_of, ratings_of_each, watt_per_power
 from .registry import REGISTRY, algorithms
-from .scene import Runs, Scene, figures_of_merit, one_blas_thread, reachable_solution, reachable_weights
+from .scene import Runs, figures_of_merit, one_blas_thread, reachable_solution, reachable_weights
 from .study_report import Parameter, StudyReport, Table
 from .tuning import RULE, AllDivergedError, run_setting, tune
 
@@ -133,6 +133,12 @@ def compare_recordings(
             notes.append(_edge(name, tuned.setting))
     if not results:
         raise ValueError(f"every algorithm diverged: {' '.join(notes)} Check the secondary path, and its sign")
+    tables = []
+    if several:
+        headings = ["", *(f"loudspeaker {j + 1}" for j in range(n_loudspeakers))]
+        rows = [[name, *(output_power(run.control_signal) / scene.rated_power)] for name, run in results.items()]
+        caption = "Output power of each loudspeaker over its rated power, in the steady half"
+        tables.append(Table("powers", caption, headings, rows))
     return StudyReport(
         "own-data",
         "Your recordings",
@@ -147,7 +153,7 @@ def compare_recordings(
         figures=list(run_figures(results, limits.rated_power, watts, start / fs)),
         sounds=list(run_sounds(results)),
         notes=[*notes, *remarks],
-        tables=[_power_table(results, scene)] if several else [],
+        tables=tables,
         watt_per_power=None if several else watts,
         extra={
             "rated_powers": limits.rated_power,
@@ -156,13 +162,6 @@ def compare_recordings(
             "rating_decided_by": limits.decided_by,
         },
     )
-
-
-def _power_table(results: dict[str, SimulationResult], scene: Scene) -> Table:
-    """Return the power of each loudspeaker over its rated power."""
-    rows = [[name, *(output_power(run.control_signal) / scene.rated_power)] for name, run in results.items()]
-    headings = ["", *(f"loudspeaker {j + 1}" for j in range(len(scene.rated_power)))]
-    return Table("powers", "Output power of each loudspeaker over its rated power, in the steady half", headings, rows)
 
 
 def _edge(name: str, setting: Any) -> str:

@@ -165,13 +165,17 @@ def secondary_path_gain(
     >>> secondary_path_gain([0.0, 2.0])
     4.0
     """
-    from scipy.signal import correlate
+    from scipy.signal import correlate, lfilter
 
     taps = path_taps(path, fs=fs)
     if reference is not None:
         if band is not None:
             raise ValueError("band and reference exclude each other: give one of them")
-        return _gain_for_reference(taps, reference)
+        x = as_signal(reference, "reference", min_length=taps.size)
+        power = np.mean(x[taps.size - 1 :] ** 2)
+        if power == 0:
+            raise ValueError("reference must not be silent: the gain for it is undefined")
+        return float(np.mean(lfilter(taps, 1.0, x)[taps.size - 1 :] ** 2) / power)
     if band is None:
         return float(taps @ taps)
     fs = sampling_rate(path, fs)
@@ -180,17 +184,6 @@ def secondary_path_gain(
     lags, autocorrelation = np.arange(taps.size), correlate(taps, taps)[taps.size - 1 :]
     mean_cosine = (high * np.sinc(2 * lags * high / fs) - low * np.sinc(2 * lags * low / fs)) / (high - low)
     return float(autocorrelation[0] + 2 * autocorrelation[1:] @ mean_cosine[1:])
-
-
-def _gain_for_reference(taps: np.ndarray, reference: Any) -> float:
-    from scipy.signal import lfilter
-
-    x = as_signal(reference, "reference", min_length=taps.size)
-    filtered = lfilter(taps, 1.0, x)[taps.size - 1 :]
-    power = np.mean(x[taps.size - 1 :] ** 2)
-    if power == 0:
-        raise ValueError("reference must not be silent: the gain for it is undefined")
-    return float(np.mean(filtered**2) / power)
 
 
 @dataclass(frozen=True)

@@ -248,11 +248,6 @@ def path_taps(path: PathModel, *, fs: float | None = None, n_taps: int | None = 
         taps = _infinite_response(path, 2 * n_taps, name)
     if not np.all(np.isfinite(taps)):
         raise ValueError(f"{name} must have finite coefficients, but its response holds NaN or Inf")
-    return _cut(taps, n_taps, name)
-
-
-def _cut(taps: np.ndarray, n_taps: int | None, name: str) -> np.ndarray:
-    """Pad or cut `taps` to `n_taps`; refuse to cut off more than -60 dB of the energy."""
     if n_taps is None or n_taps == taps.size:
         return taps
     lost, energy = np.sum(taps[n_taps:] ** 2), np.sum(taps**2)

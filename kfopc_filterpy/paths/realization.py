@@ -83,6 +83,7 @@ def realize_paths(paths: PathModels, order: int, *, fs: float | None = None) -> 
     (4, True)
     """
     from control import StateSpace, eigensys_realization
+    from scipy.signal import dimpulse
 
     taps, fs = sampled_path_matrix(paths, fs, "paths", "(outputs, inputs, taps)")
     outputs, inputs, n_taps = taps.shape
@@ -96,15 +97,8 @@ def realize_paths(paths: PathModels, order: int, *, fs: float | None = None) -> 
     if order > (most := np.sum(sizes > 1e-13 * sizes[0])):
         raise ValueError(f"order must be at most {most}, the number of states that the paths have, got {order}")
     system = StateSpace(balanced.A, balanced.B, balanced.C, balanced.D, 1 / fs)
-    return PathRealization(system, _residual_db(taps, system))
-
-
-def _residual_db(taps: np.ndarray, system: control.StateSpace) -> np.ndarray:
-    """Return the relative error energy of the impulse responses in dB, (outputs,); the model's may be longer."""
-    from scipy.signal import dimpulse
-
-    responses = dimpulse((system.A, system.B, system.C, system.D, 1), n=2 * taps.shape[2])[1]  # (inputs, n, outputs)
-    error = np.transpose(responses, (2, 0, 1)).copy()
-    error[..., : taps.shape[2]] -= taps
+    responses = dimpulse((system.A, system.B, system.C, system.D, 1), n=2 * n_taps)[1]  # (inputs, n, outputs)
+    error = np.transpose(responses, (2, 0, 1)).copy()  # the model's responses may be longer
+    error[..., :n_taps] -= taps
     energy = np.maximum(np.sum(taps**2, axis=(1, 2)), np.finfo(float).tiny)
-    return 10 * np.log10(np.maximum(np.sum(error**2, axis=(1, 2)) / energy, 1e-30))
+    return PathRealization(system, 10 * np.log10(np.maximum(np.sum(error**2, axis=(1, 2)) / energy, 1e-30)))

@@ -102,7 +102,7 @@ class PathTolerance:
 
     def relative_error(self, omega: np.ndarray) -> np.ndarray:
         """Return the largest ``|S/S^ - 1|`` within the tolerances, at frequencies `omega` in radians per sample."""
-        gain = self._largest_gain
+        gain = 10.0 ** (self.gain_db / 20.0)
         return np.sqrt((gain - 1.0) ** 2 + 4.0 * gain * np.sin(self._largest_phase(omega) / 2.0) ** 2)
 
     def share(self, omega: np.ndarray, *, largest_phase_deg: float = LARGEST_PHASE_DEG) -> np.ndarray:
@@ -115,10 +115,6 @@ class PathTolerance:
 
     def _largest_phase(self, omega: np.ndarray) -> np.ndarray:
         return np.minimum(np.deg2rad(self.phase_deg) + self.delay_samples * np.asarray(omega), np.pi)
-
-    @property
-    def _largest_gain(self) -> float:
-        return float(10.0 ** (self.gain_db / 20.0))
 
 
 # Tolerances; a relative error for all frequencies, or one for each of several from 0 to fs/2; or measured paths.

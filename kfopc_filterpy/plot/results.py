@@ -41,7 +41,12 @@ class Curve(NamedTuple):
 
     def line(self) -> dict[str, Any]:
         """Return the label, with the time of a divergence, and the line style of a smooth curve."""
-        return {"label": _label(self), **self.style, "marker": ""}
+        label = self.label
+        ends = [run.diverged_at_s for run in self.runs if run.diverged_at_s is not None]
+        if ends:
+            several = f"{len(ends)} of {len(self.runs)} runs " if len(self.runs) > 1 else ""
+            label += f" ({several}diverged at {min(ends):.3g} s)"
+        return {"label": label, **self.style, "marker": ""}
 
     def draw(self, ax: Axes, y: np.ndarray, i: int, samples: np.ndarray | None = None) -> None:
         """Draw some samples of `y`, (n,) or (n_loudspeakers, n), over time, thin, solid and with sparse markers.
@@ -174,11 +179,3 @@ def span_times(ax: Axes, run: SimulationResult, part: slice, span_s: tuple[float
 def thinned(n_samples: int, step: int = 1, most: int = 4000) -> np.ndarray:
     """Return the indices of every step-th sample, of fewer if these are more than `most`."""
     return np.arange(0, n_samples, max(1, step, -(-n_samples // most)))
-
-
-def _label(curve: Curve) -> str:
-    ends = [run.diverged_at_s for run in curve.runs if run.diverged_at_s is not None]
-    if not ends:
-        return curve.label
-    several = f"{len(ends)} of {len(curve.runs)} runs " if len(curve.runs) > 1 else ""
-    return f"{curve.label} ({several}diverged at {min(ends):.3g} s)"

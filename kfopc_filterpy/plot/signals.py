@@ -5,7 +5,7 @@ The conventions on results, axes, units and errors are those of `kfopc_filterpy.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -83,7 +83,9 @@ def plot_error_spectra(
     fs = shown[0].run.fs
     scale, unit = np.ones(1), "1"
     if pascal_per_unit is not None:
-        scale, unit = _over_20_micropascal(pascal_per_unit, shown[0].run, channel), "(20 µPa)²"
+        pascals = per_channel(pascal_per_unit, len(np.atleast_2d(shown[0].run.error)), "microphones", "pascal_per_unit")
+        scale, unit = pascals[:, np.newaxis] / SOUND_PRESSURE, "(20 µPa)²"
+        scale = scale if channel is None else one_channel(scale, channel)
     low, high = as_band((0.0, fs / 2) if band is None else band, fs)
     part, steady = (slice(None), 0.5) if span_s is None else (span_of(shown[0].run, span_s), 1.0)
     spectra = []
@@ -107,13 +109,6 @@ def plot_error_spectra(
     ax.set_xlim(low, high)
     power = f"Power per Hz (dB re {unit}/Hz)" if scaling == "density" else f"Power (dB re {unit})"
     return labelled(ax, xlabel="Frequency (Hz)", ylabel=power)
-
-
-def _over_20_micropascal(pascal_per_unit: Any, run: SimulationResult, channel: int | None) -> np.ndarray:
-    """Return the sound pressure over 20 µPa for a value of 1, (1,), or of each microphone, (K, 1)."""
-    pascals = per_channel(pascal_per_unit, len(np.atleast_2d(run.error)), "microphones", "pascal_per_unit")
-    scale = pascals[:, np.newaxis] / SOUND_PRESSURE
-    return scale if channel is None else one_channel(scale, channel)
 
 
 def plot_anti_noise(
