@@ -333,16 +333,13 @@ def tune(
         names = [name for name, algorithm in REGISTRY.items() if algorithm.of_paper]
     made = dict(trials or {})
     made |= try_settings(runs, scene, {name: REGISTRY[name].grid for name in names if name not in made}, seeds)
-    return {name: _refined(runs, scene, name, made[name], seeds) for name in names}
-
-
-def _refined(runs: Runs, scene: Scene, algorithm: str, trials: Sequence[Trial], seeds: int) -> Tuned:
-    best = best_setting(scene, algorithm, trials)
-    if best is None:
-        tried = [trial.setting for trial in trials]
-        raise AllDivergedError(f"{algorithm} diverged at every setting tried: {tried}")
-    finer = REGISTRY[algorithm].finer(best.setting)
-    if not finer:
-        return best
-    own = try_settings(runs, scene, {algorithm: finer}, seeds, planned=False)[algorithm]
-    return best_setting(scene, algorithm, [*trials, *own]) or best
+    tuned = {}
+    for name in names:
+        best = best_setting(scene, name, made[name])
+        if best is None:
+            raise AllDivergedError(f"{name} diverged at every setting tried: {[trial.setting for trial in made[name]]}")
+        if finer := REGISTRY[name].finer(best.setting):
+            near = try_settings(runs, scene, {name: finer}, seeds, planned=False)[name]
+            best = best_setting(scene, name, [*made[name], *near]) or best
+        tuned[name] = best
+    return tuned

@@ -314,7 +314,7 @@ def _absorption(size: np.ndarray, reverberation_time_s: Any, absorption: Any, c:
                 f"reverberation_time_s must be at least {shortest:.3g} s in this room, where walls that absorb everything "
                 f"reach it by Sabine's formula, got {wanted:g} s; absorption=1.0 is a free field"
             )
-        absorption = _pyroomacoustics().inverse_sabine(wanted, size, c=c)[0]
+        absorption = optional_module("pyroomacoustics", "rooms", "room_paths").inverse_sabine(wanted, size, c=c)[0]
     if not isinstance(absorption, Mapping):
         absorption = dict.fromkeys(WALLS, absorption)
     if set(absorption) != set(WALLS):
@@ -344,7 +344,7 @@ def _image_sources(
     An image of order n along a side L lies at least (n - 1) L away. By Cauchy and Schwarz, no image within the reach has
     orders along the three sides that sum to more than ``3 + reach * sqrt(sum 1/L^2)``.
     """
-    pra = _pyroomacoustics()
+    pra = optional_module("pyroomacoustics", "rooms", "room_paths")
     order = 0 if _is_free_field(walls) else int(3 + reach_m * np.sqrt(np.sum(size**-2.0)))
     # The images depend neither on the sampling rate nor on the microphone, but pyroomacoustics asks for them.
     room = pra.ShoeBox(
@@ -383,7 +383,3 @@ def _pulses(arrivals: np.ndarray, amplitudes: np.ndarray, n_taps: int) -> np.nda
     pulses = np.where(np.abs(t) < width, amplitudes * np.sinc(t) * (0.5 + 0.5 * np.cos(np.pi * t / width)), 0.0)
     within = (n >= 0) & (n < n_taps)
     return np.bincount(n[within], weights=pulses[within], minlength=n_taps)
-
-
-def _pyroomacoustics() -> Any:
-    return optional_module("pyroomacoustics", "rooms", "room_paths")

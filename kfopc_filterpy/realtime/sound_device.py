@@ -93,7 +93,13 @@ class SoundDevice:
 
     def start(self) -> None:
         """Open the stream, with the silence that goes ahead."""
-        sounddevice = _sounddevice()
+        try:
+            sounddevice = optional_module("sounddevice", "realtime", "SoundDevice")
+        except OSError as error:
+            raise ImportError(
+                f"sounddevice did not find the PortAudio library ({error}): install it, for example with "
+                "'apt install libportaudio2'"
+            ) from error
         self._heard: SimpleQueue[tuple[np.ndarray, bool]] = SimpleQueue()
         self._played: SimpleQueue[np.ndarray] = SimpleQueue()
         self._late = 0  # blocks that silence has replaced
@@ -162,14 +168,3 @@ def _indices(channels: Sequence[int], name: str) -> list[int]:
     if not numbers or not wanted or len(set(numbers)) != len(numbers):
         raise ValueError(f"{name} must be one or more different channel numbers from 0, got {channels!r}")
     return [int(n) for n in numbers]
-
-
-def _sounddevice() -> Any:
-    """Return the module sounddevice."""
-    try:
-        return optional_module("sounddevice", "realtime", "SoundDevice")
-    except OSError as error:
-        raise ImportError(
-            f"sounddevice did not find the PortAudio library ({error}): install it, for example with "
-            "'apt install libportaudio2'"
-        ) from error

@@ -47,8 +47,10 @@ class _Layout(NamedTuple):
     has_decimal_comma: bool
 
     def plain(self, line: str) -> str:
-        """Return a line without quotes, decimal commas and a separator at its end."""
-        line = _unquoted(line).rstrip()
+        """Return a line without quotes, decimal commas and a separator at its end; a comma within quotes is decimal."""
+        if '"' in line:
+            line = _QUOTED.sub(lambda quoted: _DECIMAL_COMMA.sub(".", quoted[1]), line)
+        line = line.rstrip()
         line = _DECIMAL_COMMA.sub(".", line) if self.has_decimal_comma else line
         return line.rstrip(self.delimiter) if self.delimiter else line
 
@@ -98,11 +100,6 @@ def _lines(path: str | os.PathLike[str]) -> Iterator[str]:
         is_beside = _TEKTRONIX.match(first)
         for line in chain((first,), text):
             yield line.split(",", 3)[-1] if is_beside else line
-
-
-def _unquoted(line: str) -> str:
-    """Return a line without its quotes; a comma within them is a decimal comma."""
-    return _QUOTED.sub(lambda quoted: _DECIMAL_COMMA.sub(".", quoted[1]), line) if '"' in line else line
 
 
 def _layout(path: str | os.PathLike[str], head: list[str]) -> _Layout:
