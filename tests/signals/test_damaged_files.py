@@ -240,7 +240,7 @@ CLAIMS = {
     "cells.mat": "no array of real numbers",
     "x.npz": "claims 2e\\+07 samples",
     "header.npz": "claims 2e\\+07 samples",
-    "x.npy": "its header claims 8000000000000 bytes of data",
+    "x.npy": "claims 1e\\+12 samples",
     "new.mat": "claims 1e\\+11 samples",
     "chunks.mat": "its 500000 chunks take as much memory as 2.56e\\+08 samples",
     "inflated.mat": "is damaged: a chunk is larger than its 2400 bytes",
