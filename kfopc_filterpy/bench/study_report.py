@@ -14,10 +14,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FIGURES_OF_MERIT = (
-    *("noise_reduction_db", "output_power", "peak_control_signal", "clipped_fraction"),
-    *("harmonics_db", "convergence_time_s", "diverged_at_s"),
+MERIT_COLUMNS = (  # heading, unit, figure of merit and format
+    ("noise reduction", "dB", "noise_reduction_db", ".1f"),
+    ("output power", "", "output_power", ".5g"),
+    ("of rated power", "times", "output_power", ".4g"),
+    ("peak control signal", "", "peak_control_signal", ".4g"),
+    ("clipped", "%", "clipped_fraction", ".2f"),
+    ("harmonics", "dB", "harmonics_db", ".1f"),
+    ("converged", "s", "convergence_time_s", ".4g"),
+    ("diverged", "s", "diverged_at_s", ".4g"),
 )
+FIGURES_OF_MERIT = tuple(dict.fromkeys(figure for _, _, figure, _ in MERIT_COLUMNS))
 OF_THE_PAPER = "Claims of the paper"
 HEADROOM = 4.0  # peak of a sound, over that of the study's first sound, beyond which it is clipped
 SINCE_SWITCH_ON = "Time since switch-on (s)"
@@ -314,25 +321,18 @@ def jsonable(value: object, where: str = "value") -> Any:
 def merit_table(study: StudyReport) -> tuple[list[tuple[str, str]], list[list[str]]]:
     """Return the headings and units of the figures of merit, and the cells of each algorithm, "-" if there is no figure."""
     watt = study.watt_per_power
-    columns = [
-        ("noise reduction", "dB", "noise_reduction_db", ".1f", 1.0),
-        ("output power", "" if watt is None else "W", "output_power", ".5g", watt or 1.0),
-        ("of rated power", "times", "output_power", ".4g", 1 / study.rated_power),
-        ("peak control signal", "", "peak_control_signal", ".4g", 1.0),
-        ("clipped", "%", "clipped_fraction", ".2f", 100.0),
-        ("harmonics", "dB", "harmonics_db", ".1f", 1.0),
-        ("converged", "s", "convergence_time_s", ".4g", 1.0),
-        ("diverged", "s", "diverged_at_s", ".4g", 1.0),
-    ]
+    factors = {"output power": watt or 1.0, "of rated power": 1 / study.rated_power, "clipped": 100.0}
+    units = {"output power": "" if watt is None else "W"}
+    headings = [(heading, units.get(heading, unit)) for heading, unit, *_ in MERIT_COLUMNS]
 
-    def cell(value: float | None, form: str, scale: float) -> str:
-        return "-" if value is None else f"{value * scale:{form}}"
+    def cell(value: float | None, heading: str, form: str) -> str:
+        return "-" if value is None else f"{value * factors.get(heading, 1.0):{form}}"
 
     rows = [
-        [cell(jsonable(figures.get(key)), form, scale) for _, _, key, form, scale in columns]
+        [cell(jsonable(figures.get(key)), heading, form) for heading, _, key, form in MERIT_COLUMNS]
         for figures in study.algorithms.values()
     ]
-    return [(heading, unit) for heading, unit, *_ in columns], rows
+    return headings, rows
 
 
 def file_of(folder: Path, study: StudyReport, item: FigureItem | Sound | Table) -> Path:
