@@ -35,20 +35,15 @@ QUIETEST_DB = -60.0  # re rated power that is drawn
 WIDTH, HEIGHT, SIDE = 470, 285, 290
 BLUE, GREEN, ORANGE, GREY = "#0072B2", "#009E73", "#D55E00", "#777777"
 RELATIVE, ABSOLUTE = 0, 1
-CURVES = {  # of each plot: the curve's key, its legend, colour and dash
-    "spectrum": [("disturbance", "without control", GREY, "solid"), ("error", "with control", BLUE, "solid")],
-    "wave": [
-        ("asked", "control signal", BLUE, "solid"),
-        ("delivered", "after the amplifier", GREEN, "dashed"),
-        ("upper", "peak of a sine at rated power", ORANGE, "dotdash"),
-        ("lower", "peak of a sine at rated power", ORANGE, "dotdash"),
-    ],
-    "power": [
-        ("asked", "control signal", BLUE, "solid"),
-        ("delivered", "after the amplifier", GREEN, "dashed"),
-        ("rating", "rated power", ORANGE, "dotdash"),
-    ],
-    "level": [("disturbance", "without control", GREY, "solid"), ("error", "with control", BLUE, "solid")],
+# The curve's key, its legend, colour and dash.
+_HEARD = [("disturbance", "without control", GREY, "solid"), ("error", "with control", BLUE, "solid")]
+_PLAYED = [("asked", "control signal", BLUE, "solid"), ("delivered", "after the amplifier", GREEN, "dashed")]
+_PEAKS = [(key, "peak of a sine at rated power", ORANGE, "dotdash") for key in ("upper", "lower")]
+CURVES = {  # of each plot
+    "spectrum": _HEARD,
+    "wave": [*_PLAYED, *_PEAKS],
+    "power": [*_PLAYED, ("rating", "rated power", ORANGE, "dotdash")],
+    "level": _HEARD,
 }
 
 
@@ -62,7 +57,7 @@ def serve_explore(
     Parameters
     ----------
     setups : sequence of AcousticSetup, optional
-        Setups to choose from, see `read_setup`; by default those of `explore_setups`.
+        Setups to choose from, see `AcousticSetup`; by default those of `explore_setups`.
     port : int, default 5006
         Port; 0 for a free one.
     announce : callable, default print
