@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult
-from kfopc_filterpy.bench import FigureItem, Parameter, Scene, Sound, Trial, Tuned, algorithms
+from kfopc_filterpy import SimulationResult, noise_reduction_db
+from kfopc_filterpy.bench import FigureItem, Parameter, Scene, Sound, StudyReport, Trial, Tuned, algorithms
 from kfopc_filterpy.bounds import power_constrained_solution
 from kfopc_filterpy.plot import curve_style, plot_bode
 
@@ -19,6 +20,12 @@ BANDPASS_PATHS = {
     "primary_path": Parameter("band-pass FIR, 20-5000 Hz, 128 taps", "the paper's; Hamming window"),
     "secondary_path": Parameter("band-pass FIR, 20-5000 Hz, 32 taps", "the paper's; Hamming window"),
 }
+
+
+def report_of_rows(rows: Iterable[Any], **report: Any) -> StudyReport:
+    """Return the report of a study beyond the paper, with its rows for results.json."""
+    extra = {"rows": [asdict(row) for row in rows], **report.pop("extra", {})}
+    return StudyReport(**{"fs": FS, "rated_power": 1.0, "claims_heading": "Findings", "extra": extra} | report)
 
 
 # ---- Figures
@@ -182,7 +189,7 @@ def tuning_note(tuned: Mapping[str, Tuned]) -> list[str]:
 def first_second_db(result: SimulationResult) -> float:
     """Return the noise reduction over the first second in dB."""
     first = slice(0, int(result.fs))
-    return float(-10 * np.log10(np.sum(result.error[first] ** 2) / np.sum(result.disturbance[first] ** 2)))
+    return noise_reduction_db(result.error[first], result.disturbance[first], steady=1.0)
 
 
 def milliseconds(time_s: float | None) -> str:
