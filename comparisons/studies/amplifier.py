@@ -82,15 +82,14 @@ def main(runs: Runs) -> StudyReport:
         own, best = run_case(runs, case, pairs[case.path])
         rows += own
         tuned[f"{case}, {case.amplifier}"] = {at: parts.tuned_in_words(one) for at, one in best.items()}
-    return StudyReport(
+    return parts.report_of_rows(
+        rows,
         name="amplifier",
         title="An amplifier that saturates",
         summary=(
             "A tone and a band noise that ask for up to 20 dB more than the rated power, and an amplifier, hard clip or soft "
             "saturation (Rapp, p = 2), that puts out sqrt(2 rated power) at most. Settings are tuned at every overdrive."
         ),
-        fs=FS,
-        rated_power=1.0,
         parameters=parts.driven_parameters(DURATION_S, list(OVERDRIVES_DB))
         | {
             "amplitude_limits": Parameter(
@@ -99,12 +98,10 @@ def main(runs: Runs) -> StudyReport:
             "overrun": Parameter(OVERRUN, "power that the last weights ask for over what cancels the noise"),
             "settings": Parameter(tuned, "best and tried at each overdrive, without and with the amplifier known"),
         },
-        extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
-        figures=amplifier_figures(rows),
+        figures=[_figure(case, own) for case, own in grouped(rows, "path", "noise", "amplifier").items()],
         notes=parts.without_measured(pairs),
         tables=[_table(rows)],
-        claims_heading="Findings",
     )
 
 
@@ -191,13 +188,42 @@ def _run(
 
 def claims(rows: Sequence[AmplifierRow]) -> list[Claim]:
     """Return the findings, each on all cases; a figure that is NaN, of a run that diverged, meets none."""
+    anc, known = _of(rows, "KF-ANC"), _of(rows, "KF-ANC", KNOWN)
+    over = sum(row.overruns for row in known)
+    asked = span(row.asked_power for row in known if row.diverged_at_s is None)
+    harmonics = {row.place: np.nan_to_num(row.harmonics_db, nan=np.inf) for row in anc}
+    tones = [row for name in KEEPS_POWER for row in _of(rows, name, noise="tone", amplifier="hard clip")]
+    own, most = worst({row: row.harmonics_db - harmonics[row.place] for row in tones if row.overdrive_db > 0.0})
+    powers = {name: column(_of(rows, name), "power") for name in KEEPS_POWER}
+    free = {row.place: np.nan_to_num(row.noise_reduction_db, nan=-np.inf) for row in anc}
+    leads = {row: row.noise_reduction_db - free[row.place] for row in _of(rows, "KF-OPC") if row.overdrive_db > 0.0}
+    gains = list(leads.values())
+    behind = sorted({(row.noise, row.overdrive_db) for row, lead in leads.items() if not lead > 0.0})
     return [
         _overruns(rows, "KF-ANC"),
         _overruns(rows, "clipping FxLMS"),
-        _known(rows),
-        _clean(rows),
-        _power(rows),
-        _ordering(rows),
+        Claim(
+            "With the amplifier known to its disturbance estimate KF-ANC overruns nowhere",
+            over == 0,
+            f"{over} of {len(known)} runs overrun; weights ask for {asked} times the power that cancels the noise",
+        ),
+        Claim(
+            f"With a hard clip the harmonics of {' and '.join(KEEPS_POWER)} are {CLEANER_DB:g} dB below those of KF-ANC at "
+            "every overdrive",
+            bool(most <= -CLEANER_DB),
+            f"by {-most:.1f} dB at least ({own.algorithm}, {', '.join(map(str, own.place))} dB)",
+        ),
+        Claim(
+            "KF-OPC and KF-PB keep their rated power to 2 % at every overdrive, although they do not know the amplifier",
+            all(bool(np.max(each) <= 1.02) for each in powers.values()),
+            "output power over the rated one: " + ", ".join(f"{name} {span(each)}" for name, each in powers.items()),
+        ),
+        Claim(
+            "KF-OPC reduces the noise more than KF-ANC at every overdrive",
+            not behind,
+            f"by {np.max(gains):+.1f} dB at best and {np.min(gains):+.1f} dB at worst"
+            + (f"; not with {', '.join(f'{noise} at {level:g} dB' for noise, level in behind)}" if behind else ""),
+        ),
     ]
 
 
@@ -215,56 +241,6 @@ def _overruns(rows: Sequence[AmplifierRow], algorithm: str) -> Claim:
         f"{over} of {len(driven)} runs; their weights end up asking for {span(column(went_on, 'asked_power'))} times the "
         f"power that cancels the tone, and grow {span(column(went_on, 'weight_growth'))} times over the second half; "
         f"{len(driven) - len(went_on)} passed 1e6 times the rated amplitude in {DURATION_S:g} s",
-    )
-
-
-def _known(rows: Sequence[AmplifierRow]) -> Claim:
-    own = _of(rows, "KF-ANC", known=KNOWN)
-    over = sum(row.overruns for row in own)
-    asked = span(row.asked_power for row in own if row.diverged_at_s is None)
-    return Claim(
-        "With the amplifier known to its disturbance estimate KF-ANC overruns nowhere",
-        over == 0,
-        f"{over} of {len(own)} runs overrun; weights ask for {asked} times the power that cancels the noise",
-    )
-
-
-def _clean(rows: Sequence[AmplifierRow]) -> Claim:
-    free = {row.place: np.nan_to_num(row.harmonics_db, nan=np.inf) for row in _of(rows, "KF-ANC")}
-    above = {
-        row: row.harmonics_db - free[row.place]
-        for name in KEEPS_POWER
-        for row in _of(rows, name, noise="tone", amplifier="hard clip")
-        if row.overdrive_db > 0.0
-    }
-    own, most = worst(above)
-    return Claim(
-        f"With a hard clip the harmonics of {' and '.join(KEEPS_POWER)} are {CLEANER_DB:g} dB below those of KF-ANC at every "
-        "overdrive",
-        bool(most <= -CLEANER_DB),
-        f"by {-most:.1f} dB at least ({own.algorithm}, {', '.join(map(str, own.place))} dB)",
-    )
-
-
-def _power(rows: Sequence[AmplifierRow]) -> Claim:
-    powers = {name: column(_of(rows, name), "power") for name in KEEPS_POWER}
-    return Claim(
-        "KF-OPC and KF-PB keep their rated power to 2 % at every overdrive, although they do not know the amplifier",
-        all(bool(np.max(own) <= 1.02) for own in powers.values()),
-        "output power over the rated one: " + ", ".join(f"{name} {span(own)}" for name, own in powers.items()),
-    )
-
-
-def _ordering(rows: Sequence[AmplifierRow]) -> Claim:
-    free = {row.place: np.nan_to_num(row.noise_reduction_db, nan=-np.inf) for row in _of(rows, "KF-ANC")}
-    own = [row for row in _of(rows, "KF-OPC") if row.overdrive_db > 0.0]
-    leads = [row.noise_reduction_db - free[row.place] for row in own]
-    behind = sorted({(row.noise, row.overdrive_db) for row, lead in zip(own, leads, strict=True) if not lead > 0.0})
-    return Claim(
-        "KF-OPC reduces the noise more than KF-ANC at every overdrive",
-        not behind,
-        f"by {np.max(leads):+.1f} dB at best and {np.min(leads):+.1f} dB at worst"
-        + (f"; not with {', '.join(f'{noise} at {level:g} dB' for noise, level in behind)}" if behind else ""),
     )
 
 
@@ -287,29 +263,26 @@ def _table(rows: Sequence[AmplifierRow]) -> Table:
     )
 
 
-def amplifier_figures(rows: Sequence[AmplifierRow]) -> list[FigureItem]:
-    """Return figures of noise reduction, distortion and output power against the overdrive, one for each case."""
-    items = []
-    for case, own in grouped(rows, "path", "noise", "amplifier").items():
-        figure, axes = parts.new_figure((11.0, 6.4), 2, 3, sharex=True, sharey="col")
-        shown = ("noise_reduction_db", "harmonics_db" if case[1] == "tone" else "coherence", "power")
-        for line, known in zip(axes, (UNKNOWN, KNOWN), strict=True):
-            for ax, value in zip(line, shown, strict=True):
-                for name in ALGORITHMS:
-                    _draw(ax, _of(own, name, known), value)
-                ax.set_ylabel(LABELS[value])
-            line[0].set_ylabel(f"amplifier {known}\n{LABELS[shown[0]]}")
-        axes[0, 0].set_ylim(top=TOP_DB)
-        axes[0, 2].set_yscale("log")
-        for ax in axes[1]:
-            ax.set_xlabel("Overdrive (dB)")
-        parts.legend_of(figure, [axes[0, 0]])
-        caption = (
-            f"{', '.join(case).capitalize()}. Above: the disturbance estimate does not know the amplifier; below: it does, if "
-            "it can. Black crosses: the filter overruns. A gap: it diverged. Output power is before the amplifier."
-        )
-        items.append(FigureItem("-".join(case).replace(" ", "-"), caption, figure))
-    return items
+def _figure(case: tuple[str, ...], rows: Sequence[AmplifierRow]) -> FigureItem:
+    """Return a figure of noise reduction, distortion and output power against the overdrive."""
+    figure, axes = parts.new_figure((11.0, 6.4), 2, 3, sharex=True, sharey="col")
+    shown = ("noise_reduction_db", "harmonics_db" if case[1] == "tone" else "coherence", "power")
+    for line, known in zip(axes, (UNKNOWN, KNOWN), strict=True):
+        for ax, value in zip(line, shown, strict=True):
+            for name in ALGORITHMS:
+                _draw(ax, _of(rows, name, known), value)
+            ax.set_ylabel(LABELS[value])
+        line[0].set_ylabel(f"amplifier {known}\n{LABELS[shown[0]]}")
+    axes[0, 0].set_ylim(top=TOP_DB)
+    axes[0, 2].set_yscale("log")
+    for ax in axes[1]:
+        ax.set_xlabel("Overdrive (dB)")
+    parts.legend_of(figure, [axes[0, 0]])
+    caption = (
+        f"{', '.join(case).capitalize()}. Above: the disturbance estimate does not know the amplifier; below: it does, if "
+        "it can. Black crosses: the filter overruns. A gap: it diverged. Output power is before the amplifier."
+    )
+    return FigureItem("-".join(case).replace(" ", "-"), caption, figure)
 
 
 def _draw(ax: Any, rows: Sequence[AmplifierRow], figure: str) -> None:

@@ -18,7 +18,7 @@ from kfopc_filterpy.metrics import overshoot
 from . import kf_pb_cases as cases
 from .cases import FS, SENSOR_NOISE_DB, Pair
 from .kf_pb_cases import CHANGING, FAULTS, STEADY, Rated, make_rated
-from .report_parts import MARK, new_figure, without_measured
+from .report_parts import MARK, new_figure, report_of_rows, without_measured
 from .rows import column, grouped, select
 
 STEPS = 10.0 ** np.arange(-3.5, 0.1, 0.5)  # of MOV-FxLMS, over the largest
@@ -88,7 +88,8 @@ def main(runs: Runs) -> StudyReport:
     classes, faults = jobs()
     rows = list(runs.map(partial(class_row, pairs), classes))
     wrong = [row for some in runs.map(partial(fault_rows, pairs), faults) for row in some]
-    return StudyReport(
+    return report_of_rows(
+        rows,
         name="kf-pb",
         title="A rated power spent best",
         summary=(
@@ -96,8 +97,6 @@ def main(runs: Runs) -> StudyReport:
             "MOV-FxLMS that keeps the rating over every 10 s; then with a secondary path that is not the estimate. The "
             "bound keeps the rating in every second; power that moves from a soft second to a loud one can exceed it."
         ),
-        fs=FS,
-        rated_power=1.0,
         parameters={
             "n_taps": Parameter(cases.N_TAPS, "of every algorithm and of the bound"),
             "duration_s": Parameter([cases.SILENT_S, cases.DURATION_S], "before and after the control is switched on"),
@@ -107,12 +106,11 @@ def main(runs: Runs) -> StudyReport:
             "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "over the disturbance"),
             "seed": Parameter(cases.SEED, "of noise and sensor noise"),
         },
-        extra={"rows": [asdict(row) for row in rows], "faults": [asdict(row) for row in wrong]},
+        extra={"faults": [asdict(row) for row in wrong]},
         claims=claims(rows, wrong),
         figures=[loss_figure(rows)],
         notes=without_measured(pairs),
         tables=[class_table(rows), case_table(rows), fault_table(wrong)],
-        claims_heading="Findings",
     )
 
 

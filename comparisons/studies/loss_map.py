@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -14,7 +14,7 @@ from kfopc_filterpy.bench import FigureItem, Parameter, Runs, StudyReport, Table
 from . import kf_pb_cases as cases
 from .cases import FS, SENSOR_NOISE_DB, Pair
 from .kf_pb_cases import FAULTS, STEADY, fixed_filters, make_rated, with_any_power
-from .report_parts import new_figure, without_measured
+from .report_parts import new_figure, report_of_rows, without_measured
 
 LONG = 4 * cases.N_TAPS  # taps that stand for a filter of any length
 FAULT = "two samples early"  # of the estimate that KF-PB gets to verify
@@ -77,7 +77,8 @@ def main(runs: Runs) -> StudyReport:
     """Run the study on the paths and noises at hand."""
     pairs = cases.all_paths()
     rows = list(runs.map(partial(loss_row, pairs), jobs()))
-    return StudyReport(
+    return report_of_rows(
+        rows,
         name="loss-map",
         title="Where the noise reduction is lost",
         summary=(
@@ -85,8 +86,6 @@ def main(runs: Runs) -> StudyReport:
             + "; ".join(f"{name}: {what}" for name, what in STAGES.items())
             + "."
         ),
-        fs=FS,
-        rated_power=1.0,
         parameters={
             "n_taps": Parameter(cases.N_TAPS, "of the control filter"),
             "duration_s": Parameter([cases.SILENT_S, cases.DURATION_S], "before and after the control is switched on"),
@@ -94,12 +93,9 @@ def main(runs: Runs) -> StudyReport:
             "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "relative to the disturbance"),
             "seed": Parameter(cases.SEED, "of noise and sensor noise"),
         },
-        extra={"rows": [asdict(row) for row in rows]},
-        claims=[],
         figures=[loss_figure(rows)],
         notes=without_measured(pairs),
         tables=[loss_table(rows)],
-        claims_heading="Findings",
     )
 
 

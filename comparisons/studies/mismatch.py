@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,8 @@ def main(runs: Runs) -> StudyReport:
         own, best = run_case(runs, case, scene, known[case.path])
         rows += own
         tuned[str(case)] = {f"{kind} {amount:g}": parts.tuned_in_words(t) for (kind, amount), t in best.items()}
-    return StudyReport(
+    return parts.report_of_rows(
+        rows,
         name="mismatch",
         title="A secondary path that is not as it was identified",
         summary=(
@@ -84,14 +85,12 @@ def main(runs: Runs) -> StudyReport:
             f"{OVERDRIVE_DB:g} dB more than the rated power. Settings tuned with the exact path show what a path that "
             "drifts does to a user; settings tuned with the wrong one, the best that each algorithm could do."
         ),
-        fs=FS,
         rated_power=1.0 / 10 ** (OVERDRIVE_DB / 10),
         parameters=parts.driven_parameters(DURATION_S, OVERDRIVE_DB)
         | {
             "mismatch": Parameter({kind: list(own) for kind, own in AMOUNTS.items()}, "degrees, dB and samples"),
             "settings": Parameter(tuned, "best and tried at each mismatch, over the known path's filtered reference"),
         },
-        extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
         figures=[_figure(rows, case) for case in dict.fromkeys(row.case for row in rows)],
         notes=[
@@ -106,7 +105,6 @@ def main(runs: Runs) -> StudyReport:
             _table(rows, "wrong", "Noise reduction over the steady half in dB", WRONG, "noise_reduction_db"),
             _table(rows, "power", "Output power over the rated one", EXACT, "power"),
         ],
-        claims_heading="Findings",
     )
 
 

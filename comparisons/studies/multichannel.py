@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -101,7 +101,8 @@ def main(runs: Runs) -> StudyReport | str:
                 rooms.map_figure(place.secondary.shape[1], noise, scene, mapped),
             ]
             sounds = _sounds(results, heard)
-    return StudyReport(
+    return parts.report_of_rows(
+        rows,
         name="multichannel",
         title="Several loudspeakers, a rated power for each",
         summary=(
@@ -110,9 +111,7 @@ def main(runs: Runs) -> StudyReport | str:
             f"{rooms.RATED_SHARE:g} of what the loudspeaker would use without a limit; the tables also have equal ratings."
         ),
         fs=rooms.FS,
-        rated_power=1.0,
         parameters=_parameters(tuned),
-        extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
         figures=[_reduction_figure(rows), *figures],
         sounds=sounds,

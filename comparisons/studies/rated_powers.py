@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, Stud
 from kfopc_filterpy.plot import curve_style
 
 from . import report_parts as parts
-from .cases import FS, SWITCH_ON_S, Case, bounds_db, grid_runs, make_case, noises, paths
+from .cases import SWITCH_ON_S, Case, bounds_db, grid_runs, make_case, noises, paths
 from .rows import WindowRow, column, figures_of, grouped, loss_claim, span, worst
 
 SHARES_DB = (-20.0, -15.0, -12.0, -9.0, -6.0, -3.0, 0.0)  # rated power over the unconstrained control power
@@ -76,7 +76,8 @@ def main(runs: Runs) -> StudyReport:
         tuned[case] = _tune(runs, joined)
         rows += _measure(runs, case, scenes, joined, tuned[case])
     means = mean_rows(rows)
-    return StudyReport(
+    return parts.report_of_rows(
+        rows,
         name="rated-powers",
         title="What a rated power buys",
         summary=(
@@ -84,10 +85,7 @@ def main(runs: Runs) -> StudyReport:
             "the power-constrained Wiener solution. If the level varies, `bound` keeps the rated power in each second, and "
             "`bound of the record` over the record. The rated power is in dB over what full control would need."
         ),
-        fs=FS,
-        rated_power=1.0,
         parameters=_parameters(tuned),
-        extra={"rows": [asdict(row) for row in rows]},
         claims=_claims(means),
         figures=[_figure(means, case) for case in tuned],
         notes=_notes(tuned),

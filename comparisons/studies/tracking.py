@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -65,14 +65,14 @@ def main(runs: Runs) -> StudyReport:
         courses.setdefault(event.name, {})[path] = own
         first[f"{event.name}, {path}"] = scenes[0]
         tuned[f"{event.name}, {path}"] = parts.tuned_in_words(best)
-    return StudyReport(
+    return parts.report_of_rows(
+        rows,
         name="tracking",
         title="Noises and paths that change",
         summary=(
             "Band noise that is 20 dB louder or softer for a while, a primary path that changes, and sweeps. The usual noise "
             f"asks for {OVERDRIVE_DB:g} dB more than the rated power. Settings are tuned on the run itself, event included."
         ),
-        fs=FS,
         rated_power=1.0 / 10 ** (OVERDRIVE_DB / 10),
         parameters=parts.driven_parameters(
             [events.JUMP_RUN_S, events.CHANGE_RUN_S, events.SWEEP_S, events.SWEEPS * events.SWEEP_S], OVERDRIVE_DB
@@ -99,7 +99,6 @@ def main(runs: Runs) -> StudyReport:
             ),
             "settings": Parameter(tuned, "best and tried of each event"),
         },
-        extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
         figures=[_figure(event, courses[event.name]) for event in events.all_events()],
         notes=[
@@ -118,7 +117,6 @@ def main(runs: Runs) -> StudyReport:
             )
         ]
         + [_settling_table(rows)],
-        claims_heading="Findings",
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -76,7 +76,8 @@ def main(runs: Runs) -> StudyReport:
             best = cases.tune_all(runs, scene, cases.grids([ALGORITHM]))
             settings[f"{path}, {noise}"] = parts.tuned_in_words(best)
             rows += runs.map(partial(run_job, scene, estimates, best[ALGORITHM], path, noise), jobs())
-    return StudyReport(
+    return parts.report_of_rows(
+        rows,
         name="uncertain-path",
         title="A secondary path that is known within a tolerance",
         summary=(
@@ -85,7 +86,6 @@ def main(runs: Runs) -> StudyReport:
             "nothing, which takes the estimate for exact, for its default, or for the error as it is, or the uncertainty "
             "that the identification returned, as stated."
         ),
-        fs=FS,
         rated_power=RATED_SHARE,
         parameters=parts.case_parameters(Parameter(N_TAPS, "as in the other studies of wrong estimates"))
         | {
@@ -97,7 +97,6 @@ def main(runs: Runs) -> StudyReport:
             "seed": Parameter(SEED, "of noise and sensor noise"),
             "settings": Parameter(settings, "with the exact path"),
         },
-        extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
         figures=[_figure(rows)],
         notes=[*parts.without_measured(pairs), _power_note(rows), "There is one seed and one record for each case."],
@@ -105,7 +104,6 @@ def main(runs: Runs) -> StudyReport:
             _table(rows, "worst", "Least noise reduction in dB over any second after the first", "worst_second_db"),
             _table(rows, "steady", "Noise reduction in dB over the steady half", "noise_reduction_db"),
         ],
-        claims_heading="Findings",
     )
 
 
