@@ -24,8 +24,8 @@ BANDPASS_PATHS = {
 
 def report_of_rows(rows: Iterable[Any], **report: Any) -> StudyReport:
     """Return the report of a study beyond the paper, with its rows for results.json."""
-    extra = {"rows": [asdict(row) for row in rows], **report.pop("extra", {})}
-    return StudyReport(**{"fs": FS, "rated_power": 1.0, "claims_heading": "Findings", "extra": extra} | report)
+    own: dict[str, Any] = {"fs": FS, "rated_power": 1.0, "claims_heading": "Findings"} | report
+    return StudyReport(**own | {"extra": {"rows": [asdict(row) for row in rows]} | own.get("extra", {})})
 
 
 # ---- Figures

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._types import NumberOrArray, PathModels, PerLoudspeaker
-from .._validate import as_channels, as_count, as_positive, as_signal, per_channel, per_loudspeaker
+from .._validate import as_count, as_positive, per_channel, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..core.block import Algorithm, Block, InUse, Shape, reason_of
 from ..core.own import load_algorithm as load_algorithm
@@ -21,15 +21,7 @@ from ..power.constraint import NUMBERS, Constraints, OutputPowerConstraint
 from ..power.limiter import Limiters, OutputLimiter
 from .base import Looped, calls_of, constraint_for, listed, require_rates
 from .channels import Channels
-from .processing import (
-    BlockProcessing,
-    RefusedUpdate,
-    adapt_flags,
-    output_array,
-    require_apart,
-    require_one_length,
-    takes_none,
-)
+from .processing import BlockProcessing, RefusedUpdate, adapt_flags, block_signals, checked_block
 
 NO_SOLUTION = "the update has no solution: the covariance P is too large, S = x' P x' + q could overflow"
 OVERFLOW = (
@@ -531,18 +523,9 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         looped = self.looped()
         if looped is None:
             return super().process(references, errors, adapt=adapt, out=out)
-        e = self._block_signal(errors, "errors", self.n_microphones)
-        if takes_none(self, references):
-            x = np.empty((0, e.shape[-1]))
-        else:
-            x = self._block_signal(references, "references", self.n_references)
-        require_one_length(x, e)
-        n_samples = x.shape[-1]
-        flags = adapt_flags(adapt, n_samples)
-        require_apart(out, x, e)
-        y = output_array(out, (self.n_loudspeakers, n_samples) if self.multichannel else e.shape)
-        rows = [np.atleast_2d(signal) for signal in (x, e, y)]
-        done = 0
+        x, e, flags, y = checked_block(self, references, errors, adapt, out)
+        rows = [np.atleast_2d(np.ascontiguousarray(signal)) for signal in (x, e, y)]
+        done, n_samples = 0, x.shape[-1]
         with self.in_use:
             while done < n_samples:
                 end = min(done + LONGEST_CALL, n_samples)
@@ -573,27 +556,10 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         adapt : bool or ndarray of shape (n_samples,), default True
             Whether to follow a sample; the others only enter the delay lines.
         """
-        if self.multichannel:
-            x, e = self._channel_signals(references, errors)
-        else:
-            e = as_signal(errors, "errors")
-            none = takes_none(self, references)
-            x = np.empty((e.size, 0)) if none else as_signal(references, "references", length=e.size)
-        taken = self._listen(x, e, adapt_flags(adapt, len(x)))
-        if taken < len(x):
+        x, e = block_signals(self, references, errors)
+        taken = self._listen(x.T, e.T, adapt_flags(adapt, x.shape[-1]))
+        if taken < x.shape[-1]:
             raise refused_while_listening(OVERFLOW, taken)
-
-    def _channel_signals(self, references: Any, errors: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return references and errors with a sample in each row."""
-        e = np.atleast_2d(as_channels(errors, "errors"))
-        none = takes_none(self, references)
-        x = np.empty((0, e.shape[1])) if none else np.atleast_2d(as_channels(references, "references"))
-        if (len(x), len(e)) != (self.n_references, self.n_microphones) or x.shape[1] != e.shape[1]:
-            raise ValueError(
-                f"references must be (I, n_samples) and errors (K microphones, n_samples) with I = {self.n_references}, "
-                f"K = {self.n_microphones}, got {x.shape} and {e.shape}"
-            )
-        return np.ascontiguousarray(x.T), np.ascontiguousarray(e.T)
 
     def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
         block = self._opened()

@@ -101,18 +101,8 @@ def process_steps(
     out: np.ndarray | None,
 ) -> np.ndarray:
     """Do what `BlockProcessing.process` says for any controller, by its two methods per sample."""
-    e, none = block_signal(errors, "errors"), takes_none(controller, references)
-    x = np.empty((0, e.shape[-1])) if none or references is None else block_signal(references, "references")
-    require_one_length(x, e)
-    flags = adapt_flags(adapt, x.shape[-1])
-    require_apart(out, x, e)
-    y: Any = out
-    # The channels of others show in the first sample: of a user's controller, and of one with virtual microphones.
-    if hasattr(controller, "multichannel") and not hasattr(controller, "physical"):
-        if not none:
-            require_channels(x, "references", controller.multichannel, controller.n_references)
-        require_channels(e, "errors", controller.multichannel, controller.n_microphones)
-        y = output_array(out, ((controller.n_loudspeakers,) if controller.multichannel else ()) + x.shape[-1:])
+    x, e, flags, y = checked_block(controller, references, errors, adapt, out)
+    none = takes_none(controller, references)
     with getattr(controller, "in_use", nullcontext()):
         for n in range(x.shape[-1]):
             sample = controller.control_signal(None if none else x[..., n])
@@ -125,6 +115,38 @@ def process_steps(
                 except ValueError as error:
                     raise RefusedUpdate(str(error), n) from error
     return y
+
+
+def checked_block(
+    controller: Any, references: Any, errors: Any, adapt: Any, out: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any]:
+    """Return references, errors, whether to adapt to each sample, and room for the control signals, if its shape is known."""
+    x, e = block_signals(controller, references, errors)
+    flags = adapt_flags(adapt, x.shape[-1])
+    require_apart(out, x, e)
+    if states_channels(controller):
+        out = output_array(out, ((controller.n_loudspeakers,) if controller.multichannel else ()) + x.shape[-1:])
+    return x, e, flags, out
+
+
+def block_signals(controller: Any, references: Any, errors: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the references and errors of a block, with the channels that a controller states."""
+    e = block_signal(errors, "errors")
+    none = takes_none(controller, references)
+    x = np.empty((0, e.shape[-1])) if none else block_signal(references, "references")
+    if states_channels(controller):
+        if controller.multichannel:
+            x, e = np.atleast_2d(x), np.atleast_2d(e)
+        if not none:
+            require_channels(x, "references", controller.multichannel, controller.n_references)
+        require_channels(e, "errors", controller.multichannel, controller.n_microphones)
+    require_one_length(x, e)
+    return x, e
+
+
+def states_channels(controller: object) -> bool:
+    """Return whether a controller states its channels. Those of a user's, and of virtual microphones, show in a sample."""
+    return hasattr(controller, "multichannel") and not hasattr(controller, "physical")
 
 
 def takes_none(controller: object, references: object) -> bool:

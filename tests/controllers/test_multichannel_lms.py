@@ -233,8 +233,11 @@ def test_settings_that_do_not_fit_are_refused(make: Callable[[], Any], error: ty
     [
         (lambda c: c.update([0.1, 0.2]), "error must have a value for each of the 3 microphones, got 2"),
         (lambda c: c.control_signal(1.0), "reference must have a value for each of the 2 references, got 1"),
-        (lambda c: c.listen(np.ones((1, 9)), np.ones((3, 9))), "with I = 2, K = 3, got"),
-        (lambda c: c.listen(np.ones((2, 9)), np.ones((3, 8))), "with I = 2, K = 3, got"),
+        (
+            lambda c: c.listen(np.ones((1, 9)), np.ones((3, 9))),
+            r"references must be \(2, n_samples\) for this controller",
+        ),
+        (lambda c: c.listen(np.ones((2, 9)), np.ones((3, 8))), "the same number of samples, got 9 and 8"),
         (lambda c: run(c, noise(9, 1)), r"I = 1 of reference"),
         (
             lambda c: simulate(c, noise(9), disturbance=np.ones((2, 9)), secondary_path=PATHS[:2], fs=FS),
