@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -16,7 +17,7 @@ from kfopc_filterpy.bench.scene import louder, reachable_weights
 from kfopc_filterpy.bounds import PowerConstrainedWiener
 from kfopc_filterpy.loop.inputs import disturbance_at_microphone, noise_gain
 from kfopc_filterpy.paths import duct_paths, path_taps
-from kfopc_filterpy.signals import MeasuredDuct
+from kfopc_filterpy.signals import MeasuredDuct, MeasuredRoom
 
 FS = 16000.0
 SWITCH_ON_S = 0.5
@@ -112,20 +113,31 @@ def made_noises(band_hz: tuple[float, float] = WIDE_BAND_HZ) -> dict[str, Noise]
 def noises() -> dict[str, Noise]:
     """Return the noises by name, with the motor recording if it is at hand."""
     made = made_noises()
-    measured = measured_data()
-    if measured is not None:
-        recording = measured.noise - measured.noise.mean()
-        made["motor"] = lambda duration, seed: signals.looped(recording, duration, fs=FS, start_s=2.5 * seed)
+    found = recordings("motor")
+    if found:
+        made["motor"] = lambda duration, seed: signals.looped(found["motor"], duration, fs=FS, start_s=2.5 * seed)
     return made
 
 
 @cache
-def measured_data() -> MeasuredDuct | None:
-    """Return the measured duct and the motor recording, or None if they cannot be had."""
-    try:
-        return signals.load_measured_duct(noise="motor", allow_download=True)
-    except signals.DataUnavailableError:
-        return None
+def measured_data(noise: str = "motor") -> MeasuredDuct | None:
+    """Return the measured duct and one of its recordings, or None if they cannot be had."""
+    with suppress(signals.DataUnavailableError):
+        return signals.load_measured_duct(noise=noise, allow_download=True)
+    return None
+
+
+def recordings(*names: str) -> dict[str, np.ndarray]:
+    """Return those of some recordings that can be had, without their means."""
+    ducts = {name: measured_data(name) for name in names}
+    return {name: duct.noise - duct.noise.mean() for name, duct in ducts.items() if duct is not None}
+
+
+def measured_room() -> MeasuredRoom | None:
+    """Return the measured room, or None if it cannot be had."""
+    with suppress(signals.DataUnavailableError):
+        return signals.load_measured_room(allow_download=True)
+    return None
 
 
 # ---- Scenes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,9 @@ from scipy.signal import fftconvolve
 from kfopc_filterpy import kf_pb, noise_reduction_db, power_constrained_wiener, simulate
 from kfopc_filterpy.bench.scene import reachable_weights
 from kfopc_filterpy.paths import path_taps, perturbed_path
-from kfopc_filterpy.signals import DataUnavailableError, level_jump, load_measured_duct, load_measured_room, looped
+from kfopc_filterpy.signals import level_jump, looped
 
-from .cases import FS, SENSOR_NOISE_DB, Pair, made_noises, paths
+from .cases import FS, SENSOR_NOISE_DB, Pair, made_noises, measured_room, paths, recordings
 
 N_TAPS = 256
 SILENT_S, DURATION_S = 3.0, 20.0  # before and after the control is switched on
@@ -43,8 +43,9 @@ def noises() -> dict[str, tuple[str, Make]]:
     """Return the class and the samples of each noise, recordings where they are at hand."""
     duration = SILENT_S + DURATION_S
     made: dict[str, Make] = {name: partial(make, duration, SEED) for name, make in made_noises().items()}
-    recorded = {name: partial(looped, samples, duration, fs=FS) for name, samples in recordings().items()}
-    steady = {name: made[name] for name in ("compressor", "band noise")} | recorded
+    steady = {name: made[name] for name in ("compressor", "band noise")}
+    for name, recording in recordings("motor", "compressor").items():
+        steady[f"recorded {name}"] = partial(looped, recording, duration, fs=FS)
     some = list(steady)[::2]  # a made one, and a recorded one where it is at hand
     changing: dict[str, Make] = {name: made[name] for name in ("bursts", "swelling band noise")}
     for words, jump in JUMPS.items():
@@ -53,19 +54,6 @@ def noises() -> dict[str, tuple[str, Make]]:
     return {name: (STEADY, make) for name, make in steady.items()} | {
         name: (CHANGING, make) for name, make in changing.items()
     }
-
-
-@cache
-def recordings() -> dict[str, np.ndarray]:
-    """Return the recorded noises at hand."""
-    found = {}
-    for name in ("motor", "compressor"):
-        try:
-            noise = load_measured_duct(noise=name, allow_download=True).noise
-        except DataUnavailableError:
-            continue
-        found[f"recorded {name}"] = noise - noise.mean()
-    return found
 
 
 def jumping(make: Make, gain_db: float, begin_s: float, end_s: float) -> np.ndarray:
@@ -82,11 +70,8 @@ def mixed(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 def all_paths() -> dict[str, Pair]:
     """Return the pairs of paths of the studies, with one of the measured room if it is at hand."""
-    try:
-        room = load_measured_room(allow_download=True)
-    except DataUnavailableError:
-        return paths()
-    return paths() | {"measured room": (room.primary[0, 0], room.secondary[0, 0])}
+    room = measured_room()
+    return paths() | ({} if room is None else {"measured room": (room.primary[0, 0], room.secondary[0, 0])})
 
 
 @dataclass(frozen=True)

@@ -129,8 +129,8 @@ def main(runs: Runs) -> StudyReport | str:
 
 def final_runs(runs: Runs, scene: Scene, tuned: Mapping[str, Tuned]) -> Results:
     """Run every algorithm at its best setting; those that refuse it are left out."""
-    settings = {name: best.setting for name, best in tuned.items()}
-    finals = runs.map(lambda item: bench.run_setting(scene, *item), settings.items(), worth=lambda item: 0)
+    jobs = [(name, best.setting, 0) for name, best in tuned.items()]
+    finals = bench.run_settings(runs, scene, jobs, lambda result: result, planned=False)
     return {name: result for name, result in zip(tuned, finals, strict=True) if result is not None}
 
 

@@ -15,7 +15,7 @@ from kfopc_filterpy import SimulationResult, signals
 from kfopc_filterpy.bench import FigureItem, Scene, make_scene
 from kfopc_filterpy.paths import RoomPaths, horizontal_plane, room_paths
 
-from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of
+from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of, measured_room, recordings
 from .report_parts import new_figure
 
 FS = 4000.0  # of the built-in room: ample for a band up to 500 Hz, with a quarter of the samples of 16 kHz
@@ -77,15 +77,13 @@ def places() -> dict[str, Place]:
 
 
 def _measured_place() -> Place | None:
-    try:
-        room = signals.load_measured_room(allow_download=True)
-        ducts = [signals.load_measured_duct(noise=name.split()[1], allow_download=True) for name in RECORDINGS]
-    except signals.DataUnavailableError:
+    room, found = measured_room(), recordings("compressor", "motor")
+    if room is None or len(found) < len(RECORDINGS):
         return None
     noises = _noises(room.fs, WIDE_BAND_HZ)
     del noises["compressor"]  # the recorded one takes its place
-    for name, duct in zip(RECORDINGS, ducts, strict=True):
-        noises[name] = partial(signals.looped, duct.noise - duct.noise.mean(), fs=room.fs)
+    for name, recording in zip(RECORDINGS, found.values(), strict=True):
+        noises[name] = partial(signals.looped, recording, fs=room.fs)
     return Place(MEASURED, room.fs, MEASURED_N_TAPS, room.primary, room.secondary, noises)
 
 

@@ -7,7 +7,7 @@ scenario is separate, and a single one goes through `simulate_scenarios` as well
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import lru_cache
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, clipped_fraction, convergence_time_s, noise_reduction_db, output_power
-from kfopc_filterpy.bench import AllDivergedError, Scene, algorithms, make_controller, run_setting, tune
+from kfopc_filterpy.bench import AllDivergedError, Runs, Scene, algorithms, make_controller, run_setting, tune
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot.style import decibels
@@ -175,12 +175,5 @@ def _tuned(scenario: tuple[tuple[str, Any], ...]) -> Setting | None:
     values = dict(scenario)
     with suppress(AllDivergedError):
         algorithm = values["algorithm"]
-        return tune(_OneByOne(), scene_of(values), (algorithm,))[algorithm].setting  # type: ignore[arg-type]
+        return tune(Runs(workers=1), scene_of(values), (algorithm,))[algorithm].setting  # the other cores have jobs too
     return None
-
-
-class _OneByOne:
-    """A `Runs` for `tune` that stays in this thread, since the other cores have jobs too."""
-
-    def map(self, job: Callable[[Any], Any], items: Iterable[Any], worth: Any = None) -> list[Any]:
-        return [job(item) for item in items]

@@ -61,6 +61,8 @@ class Runs:
     ----------
     bar : tqdm bar, optional
         Bar that advances as jobs end.
+    workers : int, optional
+        Threads; by default one for each core.
 
     Examples
     --------
@@ -70,10 +72,10 @@ class Runs:
     ([1, 4, 9], 3)
     """
 
-    def __init__(self, bar: Counter | None = None) -> None:
+    def __init__(self, bar: Counter | None = None, workers: int | None = None) -> None:
         self.bar = bar
         self.done = 0
-        self._pool = ThreadPoolExecutor(max_workers=os.cpu_count())
+        self._pool = ThreadPoolExecutor(max_workers=workers or os.cpu_count())
 
     def map(
         self, job: Callable[[Item], Outcome], items: Iterable[Item], worth: Callable[[Item], int] = lambda item: 1

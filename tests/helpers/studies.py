@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from comparisons.studies import cases, kf_pb_cases
+from comparisons.studies import cases
 from kfopc_filterpy.bench import Runs, StudyReport
 from kfopc_filterpy.bench.registry import REGISTRY
 
@@ -22,9 +22,9 @@ def smaller(*studies: Any, **constants: Any) -> Iterator[None]:
         for study in studies:
             for name, value in constants.items():
                 patch.setattr(study, name, value)
-        _forget_data()
+        cases.measured_data.cache_clear()
         yield
-    _forget_data()
+    cases.measured_data.cache_clear()
 
 
 @contextmanager
@@ -51,8 +51,3 @@ def run_study(study: Any) -> StudyReport:
 def short_duct() -> dict[str, cases.Pair]:
     """Return the paths of the modelled duct, cut short."""
     return {"duct": tuple(path[:200] for path in cases.modelled_paths()["duct"])}
-
-
-def _forget_data() -> None:
-    cases.measured_data.cache_clear()
-    kf_pb_cases.recordings.cache_clear()
