@@ -69,17 +69,16 @@ def main(runs: Runs) -> StudyReport:
     coherence = coherence_and_gain(first.disturbance, first.anti_noise, FS, BAND)
     shown = ("convergence_time_s", "noise_reduction_db")
     times, reductions = ({name: own[figure] for name, own in merits.items()} for figure in shown)
-    return StudyReport(
+    return parts.report_of_paper(
+        scene,
+        tuned,
         name="broadband",
         title="Broadband noise and a linear amplifier",
         summary=(
             f"Noise from {BAND[0]:g} to {BAND[1]:g} Hz needs {POWER_MULTIPLE:g} times the rated power of {RATED_POWER:g}. "
             "The amplifier is linear, as the paper's must be; runs with a clipping amplifier stand beside it."
         ),
-        fs=FS,
-        rated_power=RATED_POWER,
-        parameters=parts.common_parameters(scene, tuned)
-        | {
+        parameters={
             "noise": Parameter(f"Gaussian, {BAND[0]:g}-{BAND[1]:g} Hz", "the paper's band"),
             "duration_s": Parameter(DURATION_S - scene.switch_on_s, "10 s"),
             "tuning_seeds": Parameter(scene.seeds[:TUNING_SEEDS], "the settings are tuned on these"),
@@ -110,7 +109,6 @@ def main(runs: Runs) -> StudyReport:
         ],
         figures=_figures_of(results, weight_errors, clipped, clipped_scene),
         sounds=parts.sounds({name: rows[0] for name, rows in results.items()}),
-        notes=[*parts.tuning_note(tuned), parts.ceiling_note(scene)],
     )
 
 

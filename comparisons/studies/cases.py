@@ -151,10 +151,19 @@ def make_case(
     That power is of the filter with which a Kalman filter without state noise would end, ``(R_x' + q/(N P0) I) w = r``
     over the record. Without the ridge, directions that the noise hardly excites could ask for any power.
     """
-    scene = make_scene(
+    scene = unit_scene(pair, noise, n_taps=n_taps, sensor_noise_db=sensor_noise_db, seed=seed)
+    normal = louder(scene, 1.0 / np.sqrt(bound_of(scene).unconstrained.control_power))
+    return replace(normal, unconstrained_power=1.0)
+
+
+def unit_scene(
+    pair: Pair, noise: np.ndarray, *, n_taps: int, sensor_noise_db: float, seed: int, fs: float = FS
+) -> Scene:
+    """Return the scene of one noise whose Wiener control power is 1, and so is the rated power."""
+    return make_scene(
         {seed: noise},
         *pair,
-        fs=FS,
+        fs=fs,
         rated_power=1.0,
         power_multiple=1.0,
         n_taps=n_taps,
@@ -162,8 +171,6 @@ def make_case(
         sensor_noise_db=sensor_noise_db,
         nse_window_s=0.05,
     )
-    normal = louder(scene, 1.0 / np.sqrt(bound_of(scene).unconstrained.control_power))
-    return replace(normal, unconstrained_power=1.0)
 
 
 def noise_of(name: str, duration_s: float, seed: int = SEED) -> np.ndarray:

@@ -118,17 +118,16 @@ def _study(
     start = start_under_constraint(scene, tuned, results["KF-OPC"].constraint_factor)
     wiener = wiener_solution(*scene.settled, scene.secondary, scene.n_taps)
     bound = power_constrained_solution(*scene.settled, scene.secondary, scene.n_taps, RATED_POWER)
-    return StudyReport(
+    return parts.report_of_paper(
+        scene,
+        tuned,
         name=name,
         title=title,
         summary=(
             f"The noise needs {POWER_MULTIPLE:g} times the rated power of {RATED_POWER:g}, which a linear amplifier puts out. "
             f"The noise: {parameters['noise'].value} ({parameters['noise'].chosen})."
         ),
-        fs=FS,
-        rated_power=RATED_POWER,
-        parameters=parts.common_parameters(scene, tuned)
-        | parameters
+        parameters=parameters
         | {
             "duration_s": Parameter(results["KF-OPC"].error.size / FS, "10 s, or what the recording holds"),
             "amplifier": Parameter("linear", "the paper names no clipping here"),
@@ -146,7 +145,6 @@ def _study(
         tables=[_rating_table({POWER_MULTIPLE: figures, OTHER_MULTIPLE: at_smaller})],
         figures=_figures_of(results, paths),
         sounds=parts.sounds({algorithm: results[algorithm] for algorithm in PAPER}),
-        notes=[*parts.tuning_note(tuned), parts.ceiling_note(scene)],
     )
 
 

@@ -100,7 +100,9 @@ def main(runs: Runs) -> StudyReport | str:
                 _course_figure(own, {name: results[name] for name in heard}),
                 rooms.map_figure(place.secondary.shape[1], noise, scene, mapped),
             ]
-            sounds = _sounds(results, heard)
+            off = Sound("off", "First microphone, control off", results[KF_PB].disturbance[0], group="room")
+            errors = [(f"First microphone, {name}", results[name].error[0]) for name in heard]
+            sounds = [off, *(Sound(f"run-{k}", *error, group="room") for k, error in enumerate(errors))]
     return parts.report_of_rows(
         rows,
         name="multichannel",
@@ -111,7 +113,25 @@ def main(runs: Runs) -> StudyReport | str:
             f"{rooms.RATED_SHARE:g} of what the loudspeaker would use without a limit; the tables also have equal ratings."
         ),
         fs=rooms.FS,
-        parameters=_parameters(tuned),
+        parameters={
+            "fs_hz": Parameter({name: place.fs for name, place in places().items()}, "the measured room's own"),
+            "n_taps": Parameter({name: place.n_taps for name, place in places().items()}, "of each control filter"),
+            "duration_s": Parameter([DURATION_S, RECORDED_S], "from switch-on, of steady noises and of recordings"),
+            "rated_power": Parameter(
+                rooms.RATED_SHARE, "of each loudspeaker's without a limit: (R_x' + q/(N P0) I) w = r"
+            ),
+            "switch_on_s": Parameter(SWITCH_ON_S, "for which the noise runs before the control"),
+            "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "below the disturbance"),
+            "room_m": Parameter(
+                list(rooms.SIZE_M), f"built-in room, T60 {rooms.REVERBERATION_S:g} s by Sabine's formula"
+            ),
+            "tones_hz": Parameter(list(rooms.TONES_HZ), "of equal level"),
+            "band_hz": Parameter([list(rooms.BAND_HZ), list(rooms.WIDE_BAND_HZ)], "built-in and measured room"),
+            "tuned": Parameter(
+                {where: parts.tuned_in_words(own) for where, own in tuned.items()},
+                f"{Tuned.RULE}; for each setting tried: the setting, mean NSE in dB, power of each loudspeaker",
+            ),
+        },
         claims=claims(rows),
         figures=[_reduction_figure(rows), *figures],
         sounds=sounds,
@@ -150,9 +170,13 @@ def channel_row(scene: Scene, result: SimulationResult | None, **place: Any) -> 
     if result is None or result.diverged_at_s is not None:
         at = 0.0 if result is None else result.diverged_at_s
         return ChannelRow(**place, diverged_at_s=at, powers=[np.nan] * scene.rated_power.size)
-    powers = output_power(result.control_signal) / scene.rated_power
     reduction = noise_reduction_db(result.error, result.disturbance)
-    return ChannelRow(**place, noise_reduction_db=reduction, power=float(np.max(powers)), powers=powers.tolist())
+    return ChannelRow(**place, noise_reduction_db=reduction, **_powers(scene, result.control_signal))
+
+
+def _powers(scene: Scene, control_signal: np.ndarray) -> dict[str, Any]:
+    powers = output_power(control_signal) / scene.rated_power
+    return {"power": float(np.max(powers)), "powers": powers.tolist()}
 
 
 def _bound_rows(scene: Scene, *, noise: str, **place: Any) -> list[ChannelRow]:
@@ -171,8 +195,7 @@ def _bound_rows(scene: Scene, *, noise: str, **place: Any) -> list[ChannelRow]:
     rows = []
     for label, solution in solutions.items():
         signal = getattr(bound, solution).control_signal
-        powers = output_power(signal) / scene.rated_power
-        figures = {"noise_reduction_db": reached[solution], "power": float(np.max(powers)), "powers": powers.tolist()}
+        figures = {"noise_reduction_db": reached[solution]} | _powers(scene, signal)
         # A rating that limits is used in full over the record. Over half of it, chance makes any power look like that.
         limited = output_power(signal, steady=1.0) > 0.995 * scene.rated_power
         rows.append(ChannelRow(**place, noise=noise, algorithm=label, **figures, limited=limited.tolist()))
@@ -248,7 +271,7 @@ def _rivals(rows: Sequence[ChannelRow]) -> list[ChannelRow]:
     return sorted(constrained, key=lambda row: -row.noise_reduction_db)
 
 
-# ---- Notes, parameters and tables
+# ---- Notes and tables
 
 
 def _notes(tuned: Mapping[str, Mapping[str, Tuned]]) -> list[str]:
@@ -266,31 +289,13 @@ def _notes(tuned: Mapping[str, Mapping[str, Tuned]]) -> list[str]:
     return notes
 
 
-def _parameters(tuned: Mapping[str, Mapping[str, Tuned]]) -> dict[str, Parameter]:
-    return {
-        "fs_hz": Parameter({name: place.fs for name, place in places().items()}, "the measured room's own"),
-        "n_taps": Parameter({name: place.n_taps for name, place in places().items()}, "of each control filter"),
-        "duration_s": Parameter([DURATION_S, RECORDED_S], "from switch-on, of steady noises and of recordings"),
-        "rated_power": Parameter(rooms.RATED_SHARE, "of each loudspeaker's without a limit: (R_x' + q/(N P0) I) w = r"),
-        "switch_on_s": Parameter(SWITCH_ON_S, "for which the noise runs before the control"),
-        "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "below the disturbance"),
-        "room_m": Parameter(list(rooms.SIZE_M), f"built-in room, T60 {rooms.REVERBERATION_S:g} s by Sabine's formula"),
-        "tones_hz": Parameter(list(rooms.TONES_HZ), "of equal level"),
-        "band_hz": Parameter([list(rooms.BAND_HZ), list(rooms.WIDE_BAND_HZ)], "built-in and measured room"),
-        "tuned": Parameter(
-            {where: parts.tuned_in_words(own) for where, own in tuned.items()},
-            f"{Tuned.RULE}; for each setting tried: the setting, mean NSE in dB, power of each loudspeaker",
-        ),
-    }
-
-
 def _table(stem: str, caption: str, rows: Sequence[ChannelRow], figure: str = "noise_reduction_db") -> Table:
     """Return a table with a line for each rating and algorithm and a column for each place and noise."""
     keys = {"ratings": "rating", "algorithm": "algorithm"}
     return figure_table(stem, caption, rows, figure, keys, dict.fromkeys(row.case for row in rows), "case")
 
 
-# ---- Figures and sounds
+# ---- Figures
 
 
 def _reduction_figure(rows: Sequence[ChannelRow]) -> FigureItem:
@@ -330,9 +335,3 @@ def _course_figure(rows: Sequence[ChannelRow], results: Results) -> FigureItem:
         f"Built-in room, {', '.join(SHOWN)}: the error of all microphones over time, the bound and the scaled solution."
     )
     return FigureItem("course", caption, figure)
-
-
-def _sounds(results: Results, heard: Sequence[str]) -> list[Sound]:
-    off = Sound("off", "First microphone, control off", results[KF_PB].disturbance[0], group="room")
-    errors = enumerate((f"First microphone, {name}", results[name].error[0]) for name in heard)
-    return [off, *(Sound(f"run-{k}", label, error, group="room") for k, (label, error) in errors)]

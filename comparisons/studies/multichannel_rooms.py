@@ -12,10 +12,10 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from kfopc_filterpy import SimulationResult, signals
-from kfopc_filterpy.bench import FigureItem, Scene, make_scene
+from kfopc_filterpy.bench import FigureItem, Scene
 from kfopc_filterpy.paths import RoomPaths, horizontal_plane, room_paths
 
-from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of, measured_room, recordings
+from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of, measured_room, recordings, unit_scene
 from .report_parts import new_figure
 
 FS = 4000.0  # of the built-in room: ample for a band up to 500 Hz, with a quarter of the samples of 16 kHz
@@ -114,18 +114,8 @@ def _noises(fs: float, band_hz: tuple[float, float]) -> dict[str, Callable[[floa
 def make_rated_scene(place: Place, noise: str, duration_s: float) -> Scene:
     """Return the scene of a noise; each loudspeaker is rated at a quarter of the power that it would use unlimited."""
     x = place.noises[noise](duration_s + SWITCH_ON_S)
-    scene = make_scene(
-        {SEED: x[np.newaxis]},
-        place.primary,
-        place.secondary,
-        fs=place.fs,
-        rated_power=1.0,
-        power_multiple=1.0,
-        n_taps=place.n_taps,
-        switch_on_s=SWITCH_ON_S,
-        sensor_noise_db=SENSOR_NOISE_DB,
-        nse_window_s=0.05,
-    )
+    own: dict[str, Any] = {"n_taps": place.n_taps, "sensor_noise_db": SENSOR_NOISE_DB, "seed": SEED, "fs": place.fs}
+    scene = unit_scene((place.primary, place.secondary), x[np.newaxis], **own)
     free = replace(scene, rated_power=1e12)
     wanted = bound_of(free, segment_s=2 * duration_s).unconstrained.control_power
     return replace(scene, rated_power=RATED_SHARE * wanted, unconstrained_power=wanted)

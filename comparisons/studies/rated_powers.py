@@ -72,7 +72,10 @@ def main(runs: Runs) -> StudyReport:
     for case in cases():
         pair, noise = paths()[case.path], noises()[case.noise]
         scenes = {seed: make_case(pair, noise(DURATION_S + SWITCH_ON_S, seed), n_taps=N_TAPS) for seed in SEEDS}
-        joined = _joined(list(scenes.values()))
+        signals: Any = {
+            name: [getattr(scene, name)[0] for scene in scenes.values()] for name in ("references", "disturbances")
+        }
+        joined = replace(scenes[SEEDS[0]], **signals, seeds=list(SEEDS))  # one scene with the noises of all seeds
         tuned[case] = _tune(runs, joined)
         rows += _measure(runs, case, scenes, joined, tuned[case])
     means = mean_rows(rows)
@@ -100,12 +103,6 @@ def main(runs: Runs) -> StudyReport:
 def _rated(scene: Scene, share_db: float) -> Scene:
     """Return the scene, whose unconstrained control power is 1, with a rated power."""
     return replace(scene, rated_power=10 ** (share_db / 10))
-
-
-def _joined(scenes: Sequence[Scene]) -> Scene:
-    """Return one scene with the noises of several."""
-    joined: Any = {name: [getattr(scene, name)[0] for scene in scenes] for name in ("references", "disturbances")}
-    return replace(scenes[0], **joined, seeds=list(SEEDS))
 
 
 def _tune(runs: Runs, scene: Scene) -> TunedAt:
@@ -212,17 +209,12 @@ def _notes(tuned: Mapping[Case, TunedAt]) -> list[str]:
         notes.append("The measured duct was not at hand (KFOPC_DATA): its cases are left out.")
     for name, algorithm in algorithms().items():
         own = [best[name] for shares in tuned.values() for best in shares.values()]
-        unfinished = [best for best in own if _slowest(name, best)]
+        firsts = [best.setting[0] if isinstance(best.setting, tuple) else best.setting for best in own]
+        unfinished = [mu for mu in firsts if algorithm.symbol == "mu" and mu <= min(algorithm.first)]
         if unfinished and algorithm.keeps_budget:
             where = f"{len(unfinished)} of {len(own)} points"
             notes.append(f"{name} has its grid's least step size in {where}: there it keeps its budget unconverged.")
     return notes
-
-
-def _slowest(name: str, best: Tuned) -> bool:
-    """Return whether the least step size that was tried is the best."""
-    setting = best.setting[0] if isinstance(best.setting, tuple) else best.setting
-    return algorithms()[name].symbol == "mu" and setting <= min(algorithms()[name].first)
 
 
 # ---- Tables and parameters

@@ -28,6 +28,13 @@ def report_of_rows(rows: Iterable[Any], **report: Any) -> StudyReport:
     return StudyReport(**own | {"extra": {"rows": [asdict(row) for row in rows]} | own.get("extra", {})})
 
 
+def report_of_paper(scene: Scene, tuned: Mapping[str, Tuned], **report: Any) -> StudyReport:
+    """Return the report of one of the paper's studies; its own parameters follow those that all of them state."""
+    common: dict[str, Any] = {"fs": scene.fs, "rated_power": scene.rated_power}
+    common["notes"] = [*tuning_note(tuned), ceiling_note(scene)]
+    return StudyReport(**common | report | {"parameters": common_parameters(scene, tuned) | report["parameters"]})
+
+
 # ---- Figures
 
 

@@ -47,7 +47,15 @@ def planned_runs() -> int:
 def main(runs: Runs) -> StudyReport:
     """Run the study."""
     primary, secondary = bandpass_path(128, fs=FS), bandpass_path(32, fs=FS)
-    scene = _scene(primary, secondary)
+    scene = bench.make_scene(
+        {0: tone(TONE_HZ, DURATION_S, fs=FS)},
+        *(primary, secondary),
+        fs=FS,
+        rated_power=RATED_POWER,
+        power_multiple=POWER_MULTIPLE,
+        n_taps=N_TAPS,
+        amplifier=HardClipAmplifier(LIMIT),
+    )
     tuned = bench.tune(runs, scene)
 
     def run_all(settings: Mapping[str, Setting]) -> dict[str, SimulationResult]:
@@ -55,23 +63,25 @@ def main(runs: Runs) -> StudyReport:
 
     results = run_all({name: best.setting for name, best in tuned.items()})
     forgetful, unforgetting = (run_all(dict.fromkeys(KALMAN, setting)) for setting in (FORGETFUL, UNFORGETTING))
-    merits = {name: _figures(result, scene) for name, result in results.items()}
+    merits = {
+        name: bench.figures_of_merit([r], scene) | {"harmonics_db": harmonics_db(r.error, r.disturbance, TONE_HZ, FS)}
+        for name, r in results.items()
+    }
     optimal_weight = float(np.abs(wiener_solution(*scene.settled, scene.secondary, scene.n_taps).weights).max())
     pairs = {tuned["KF-ANC"].setting: results, FORGETFUL: forgetful}
     growths = {setting: [growth_of(pair[name], optimal_weight) for name in KALMAN] for setting, pair in pairs.items()}
     sweep = _overdrive_sweep(runs, scene, tuned)
     crossings = crossings_db(OVERDRIVES_DB, sweep["KF-OPC"] - sweep["KF-ANC"])
-    return StudyReport(
+    return parts.report_of_paper(
+        scene,
+        tuned,
         name="tonal",
         title="Tonal noise and a clipping amplifier",
         summary=(
             f"A {TONE_HZ:g} Hz tone needs {POWER_MULTIPLE:g} times the rated power. The amplifier clips at "
             "sqrt(2 rated power), the peak of a sine at rated power."
         ),
-        fs=FS,
-        rated_power=RATED_POWER,
-        parameters=parts.common_parameters(scene, tuned)
-        | {
+        parameters={
             "noise": Parameter(f"sine, {TONE_HZ:g} Hz", "the paper's"),
             "duration_s": Parameter(DURATION_S - scene.switch_on_s, "long enough for the weights of KF-ANC to grow"),
             "amplifier": Parameter(f"hard clip at {LIMIT:.4f}", "the paper's, sqrt(2 rated power)"),
@@ -99,26 +109,7 @@ def main(runs: Runs) -> StudyReport:
             ),
         ],
         sounds=parts.sounds(results),
-        notes=[*parts.tuning_note(tuned), parts.ceiling_note(scene)],
     )
-
-
-def _scene(primary: Any, secondary: Any) -> Scene:
-    return bench.make_scene(
-        {0: tone(TONE_HZ, DURATION_S, fs=FS)},
-        primary,
-        secondary,
-        fs=FS,
-        rated_power=RATED_POWER,
-        power_multiple=POWER_MULTIPLE,
-        n_taps=N_TAPS,
-        amplifier=HardClipAmplifier(LIMIT),
-    )
-
-
-def _figures(result: SimulationResult, scene: Scene) -> dict[str, float | None]:
-    harmonics = harmonics_db(result.error, result.disturbance, TONE_HZ, FS)
-    return bench.figures_of_merit([result], scene) | {"harmonics_db": harmonics}
 
 
 def _extremes(result: SimulationResult, optimal_weight: float) -> dict[str, float]:
@@ -203,6 +194,13 @@ def claims(
     anc, opc = ({key: np.nan if own is None else own for key, own in merits[name].items()} for name in KALMAN)
     flips = " and ".join(f"{level:.1f} dB" for level in crossings)
     order = f"the order flips at {flips} of overdrive" if crossings else "the order is the same at every overdrive"
+    grown = "; ".join(
+        f"with r E[x'^2]/q = {setting:g} its largest weight is {free.over_optimal:.0f} times the optimal one at the end, "
+        f"{free.over_half:.2f} times that at half of the run, that of KF-OPC {kept.over_half:.2f} times"
+        for setting, (free, kept) in growths.items()
+    )
+    times = [free.diverged_at_s for free, _ in growths.values() if free.diverged_at_s is not None]
+    number = f"diverged after {min(times):.1f} s" if times else "the numbers do not overflow"
     return [
         Claim(
             "KF-ANC produces harmonics, KF-OPC does not",
@@ -220,7 +218,11 @@ def claims(
             bool(abs(opc["output_power"] / RATED_POWER - 1.0) <= POWER_TOLERANCE),
             f"output power {opc['output_power']:.4f}, rated power {RATED_POWER:g}",
         ),
-        _growth_claim(growths),
+        Claim(
+            "The control filter of KF-ANC grows without bound, that of KF-OPC does not",
+            all(free.linear_without_bound and kept.none for free, kept in growths.values()),
+            f"{grown}. The growth is a straight line; {number}",
+        ),
         Claim(
             "KF-OPC reduces the noise more than KF-ANC",
             bool(opc["noise_reduction_db"] > anc["noise_reduction_db"]),
@@ -228,21 +230,6 @@ def claims(
             f"{10 * np.log10(POWER_MULTIPLE):.0f} dB of overdrive; {order}, see the figure",
         ),
     ]
-
-
-def _growth_claim(growths: Mapping[Setting, Sequence[Growth]]) -> Claim:
-    said = "; ".join(
-        f"with r E[x'^2]/q = {setting:g} its largest weight is {anc.over_optimal:.0f} times the optimal one at the end, "
-        f"{anc.over_half:.2f} times that at half of the run, that of KF-OPC {opc.over_half:.2f} times"
-        for setting, (anc, opc) in growths.items()
-    )
-    times = [anc.diverged_at_s for anc, _ in growths.values() if anc.diverged_at_s is not None]
-    number = f"diverged after {min(times):.1f} s" if times else "the numbers do not overflow"
-    return Claim(
-        "The control filter of KF-ANC grows without bound, that of KF-OPC does not",
-        all(anc.linear_without_bound and opc.none for anc, opc in growths.values()),
-        f"{said}. The growth is a straight line; {number}",
-    )
 
 
 # ---- Figures
