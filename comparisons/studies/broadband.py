@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, bandpass_path, bench, noise_reduction_db, output_power
+from kfopc_filterpy import SimulationResult, bandpass_path, bench, output_power
 from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, figures_of_merit
-from kfopc_filterpy.metrics import coherence_and_gain, peak_control_signal
+from kfopc_filterpy.metrics import coherence_and_gain
 from kfopc_filterpy.plot import plot_disturbance_and_anti_noise, plot_error_spectra, plot_nse
 from kfopc_filterpy.signals import band_limited_noise
 
 from . import report_parts as parts
-from .cases import FS, PAPER, grid_runs
+from .broadband_clipped import clipped_claim, run_clipped, starts
+from .cases import FS, PAPER, Results, grid_runs, run_seeds
 from .report_parts import milliseconds
-from .rows import span
-from .weight_errors import WEIGHTS_EVERY, first_below_s, settled_after_s, weight_error
+from .weight_errors import WEIGHTS_EVERY, draw_weight_errors, first_below_s, settled_after_s, weight_error
 
 BAND = (200.0, 2000.0)
 DURATION_S = 10.5
@@ -32,8 +32,6 @@ SEEDS = tuple(range(1, 9))
 TUNING_SEEDS = 2
 
 SETTLED_DB = -20.0  # of the weight error
-KNOWING = "KF-OPC, known amplifier"
-UNAWARE = "KF-OPC, q without the clipping"
 
 # Criteria of the claims
 EXACT_MEAN, EXACT_EACH = 0.005, 0.015  # of the rated power
@@ -41,9 +39,6 @@ FAR_OVER = 1.5  # times the rated power
 NOT_SLOWER = 1.1  # times as long
 TWICE = 2.0
 COHERENT = 0.99
-START_DB = 1.0  # that the first second may lack
-
-Results = dict[str, list[SimulationResult]]
 
 
 def planned_runs() -> int:
@@ -61,8 +56,8 @@ def main(runs: Runs) -> StudyReport:
     settling = {name: settled_after_s(curve, SETTLED_DB) for name, curve in weight_errors.items()}
     reached = {name: first_below_s(curve, SETTLED_DB) for name, curve in weight_errors.items()}
     clipped_scene = bench.with_clipping(scene)
-    clipped = _run_clipped(runs, scene, clipped_scene, tuned)
-    clipped_figures = {name: figures_of_merit(rows, clipped_scene) | _starts(rows) for name, rows in clipped.items()}
+    clipped = run_clipped(runs, scene, clipped_scene, tuned)
+    clipped_figures = {name: figures_of_merit(rows, clipped_scene) | starts(rows) for name, rows in clipped.items()}
     other = _other_length(runs)
     powers = {name: [output_power(r.control_signal) for r in rows] for name, rows in results.items()}
     first = results["KF-OPC"][0]
@@ -146,43 +141,11 @@ def _run_recorded(runs: Runs, scene: Scene, tuned: Mapping[str, Tuned]) -> tuple
     )
 
 
-def _run_all(runs: Runs, scene: Scene, tuned: Mapping[str, Tuned]) -> Results:
-    jobs = [(name, best.setting, k) for name, best in tuned.items() for k in range(len(SEEDS))]
-    outcomes: Any = iter(bench.run_settings(runs, scene, jobs, lambda result: result))  # none of these refuses
-    return {name: [next(outcomes) for _ in SEEDS] for name in tuned}
-
-
-def _run_clipped(runs: Runs, scene: Scene, clipped: Scene, tuned: Mapping[str, Tuned]) -> Results:
-    """Return the runs with the amplifier that clips, and those of KF-OPC with the q of the linear one.
-
-    That q is right if the disturbance estimate knows the amplifier, e + s^ * amplifier(y).
-    """
-    unaware = replace(clipped, measurement_noise=scene.measurement_noise)
-    knowing = replace(unaware, known_amplifier=clipped.amplifier)
-    own = {"KF-OPC": tuned["KF-OPC"]}
-    return _run_all(runs, clipped, tuned) | {
-        name: _run_all(runs, other, own)["KF-OPC"] for name, other in ((UNAWARE, unaware), (KNOWING, knowing))
-    }
-
-
 def _other_length(runs: Runs) -> dict[str, float | None]:
     """Return the convergence times of the constrained methods with another length, tuned again on the first seed."""
     scene = _scene(OTHER_N_TAPS)
-    results = _run_all(runs, scene, bench.tune(runs, scene, CONSTRAINED))
+    results = run_seeds(runs, scene, bench.tune(runs, scene, CONSTRAINED))
     return {name: figures_of_merit(rows, scene)["convergence_time_s"] for name, rows in results.items()}
-
-
-# ---- Figures of the start
-
-
-def _starts(results: Sequence[SimulationResult]) -> dict[str, list[float]]:
-    """Return figures of each seed of the start, which the steady half does not show."""
-    return {
-        "first_second_noise_reduction_db": [parts.first_second_db(r) for r in results],
-        "steady_noise_reduction_db": [noise_reduction_db(r.error, r.disturbance) for r in results],
-        "peak_control_signal_of_the_whole_run": [peak_control_signal(r.control_signal, steady=1.0) for r in results],
-        "output_power_of_each_seed": [output_power(r.control_signal) for r in results],
-    }
 
 
 # ---- Claims, of plain figures
@@ -248,46 +211,12 @@ def linear_claim(coherence: float, gain: float, mov_reduction_db: float) -> Clai
     )
 
 
-def clipped_claim(clipped: Mapping[str, Mapping[str, Any]], limit: float) -> Claim:
-    """Return the claim about the amplifier that clips from the figures of each seed, see `_starts`."""
-
-    own = {name: {key: np.array(value) for key, value in figures.items()} for name, figures in clipped.items()}
-    first, steady = "first_second_noise_reduction_db", "steady_noise_reduction_db"
-    peak, power = "peak_control_signal_of_the_whole_run", "output_power_of_each_seed"
-    opc = own["KF-OPC"]
-    starts, kept = opc[first] >= opc[steady] - START_DB, opc[power] <= Tuned.BUDGET * RATED_POWER
-
-    def start(name: str) -> str:
-        return f"{span(own[name][first], '.1f')} dB, control signal up to {span(own[name][peak], '.1f')}"
-
-    return Claim(
-        "Where the amplifier clips, KF-OPC is stable from the start and keeps to the rated power (runs that the paper does "
-        "not show)",
-        bool(starts.size and np.all(starts) and np.all(kept)),
-        f"over {starts.size} seeds: steady half {span(opc[steady], '.1f')} dB, output power {span(opc[power], '.3f')} of "
-        f"{RATED_POWER:g}; first second {start('KF-OPC')} against a limit of {limit:.2f}: "
-        f"{100 * opc['clipped_fraction']:.1f} % of the samples are clipped, as Gaussian noise of that power must be. With the q "
-        f"of a linear amplifier, first second {start(UNAWARE)}; with the amplifier known to the disturbance estimate "
-        f"{start(KNOWING)}",
-    )
-
-
 def _or_never(time_s: float | None) -> float:
     """Return a time, infinite if there is none."""
     return np.inf if time_s is None or np.isnan(time_s) else time_s
 
 
 # ---- Figures
-
-
-def _draw_weight_errors(ax: Any, curves: Mapping[str, np.ndarray]) -> None:
-    for name, curve in curves.items():
-        start = curve[: int(0.5 * FS / WEIGHTS_EVERY)]
-        time_ms = 1e3 * np.arange(start.size) * WEIGHTS_EVERY / FS
-        ax.semilogx(time_ms[1:], 10 * np.log10(start[1:]), **parts.thin_style(name), label=name)
-    ax.axhline(SETTLED_DB, color=parts.MARK, linestyle=":")
-    ax.set(xlabel="Time (ms)", ylabel="Weight error (dB)")
-    ax.legend()
 
 
 def _figures_of(
@@ -303,7 +232,7 @@ def _figures_of(
         parts.draw(
             "a-weight-error",
             f"Error of the weights, weighted by x', over each algorithm's own steady solution, mean over {len(SEEDS)} seeds.",
-            lambda ax: _draw_weight_errors(ax, weight_errors),
+            lambda ax: draw_weight_errors(ax, weight_errors, SETTLED_DB),
         ),
         parts.draw(
             "b-error-spectra",

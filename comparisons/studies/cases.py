@@ -12,8 +12,9 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult, bandpass_path, power_constrained_wiener, signals
 from kfopc_filterpy._types import ChangingPaths
-from kfopc_filterpy.bench import Runs, Scene, Tuned, algorithms, best_setting, make_controller, make_scene, try_settings
+from kfopc_filterpy.bench import Runs, Scene, Tuned, algorithms, make_controller, make_scene, run_settings
 from kfopc_filterpy.bench.scene import louder, reachable_weights
+from kfopc_filterpy.bench.tuning import best_setting, try_settings
 from kfopc_filterpy.bounds import PowerConstrainedWiener
 from kfopc_filterpy.loop.inputs import disturbance_at_microphone, noise_gain
 from kfopc_filterpy.paths import duct_paths, path_taps
@@ -37,6 +38,7 @@ PAPER = tuple(name for name, own in algorithms().items() if own.of_paper)  # alg
 
 Setting = float | tuple[float, float]  # of an algorithm, as in the registry
 Pair = tuple[np.ndarray, np.ndarray]  # taps of the primary and the secondary path
+Results = dict[str, list[Any]]  # of algorithms, a run for each seed
 Noise = Callable[[float, int], np.ndarray]  # of a duration in s and a seed
 
 
@@ -226,6 +228,13 @@ def run_each(runs: Runs, scene: Scene, settings: Mapping[str, Setting], **record
         return scene.run(make_controller(scene, *job), **recorded)
 
     return dict(zip(settings, runs.map(run, settings.items()), strict=True))
+
+
+def run_seeds(runs: Runs, scene: Scene, tuned: Mapping[str, Tuned], planned: bool = True) -> Results:
+    """Return the runs of each algorithm at its best setting on each seed; None where a filter could not go on."""
+    jobs = [(name, best.setting, k) for name, best in tuned.items() for k in range(len(scene.seeds))]
+    outcomes = iter(run_settings(runs, scene, jobs, lambda result: result, planned))
+    return {name: [next(outcomes) for _ in scene.seeds] for name in tuned}
 
 
 def grids(names: Iterable[str]) -> dict[str, list[Setting]]:

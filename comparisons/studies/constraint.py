@@ -5,32 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, product
-from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, OutputLimiter, bench, convergence_time_s
+from kfopc_filterpy import bench, convergence_time_s
 from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned
 from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
-from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
 
 from . import cases
 from . import report_parts as parts
 from .cases import FS, SWITCH_ON_S, WINDOW_S, Case, noises, paths
-from .rows import WindowRow, cell, column, figures_of, select, span, worst
+from .constraint_amplifiers import LIMITED, ClippedRow, Settings, amplifier_table, controller_of, run_amplifiers
+from .rows import WindowRow, column, figures_of, select, span, worst
 
 N_TAPS = 160
 DURATIONS_S = (8.0, 60.0)  # settings are tuned and convergence is measured on the first; the second averages more
 SEEDS = (1, 2, 3, 4)
 SHARES = (0.25, 0.10)  # rated power over the unconstrained control power
 TUNED = ("KF-OPC", "KF-OPC repaired", "KF-PB")
-LIMITED = ("KF-OPC limited", "KF-PB limited")
 SHARED = {"KF-ANC": "KF-OPC", "KF-OPC limited": "KF-OPC", "KF-PB limited": "KF-PB"}  # whose setting each has
 CLIPPED_NOISES = ("tone", "band noise")
-JUMP_DB, JUMP_S = 20.0, (1.0, 2.0)  # of a louder second of a recording, which begins before switch-on
 
-Settings = Mapping[str, Tuned]
 Settled = Mapping[str, Mapping[str, float]]  # convergence times by case and algorithm
 
 
@@ -52,13 +48,6 @@ class ConstraintRow(WindowRow):
     def place(self) -> str:
         """Where it was run, in words."""
         return f"{self.case}, {100 * self.share:.0f} %, {self.duration_s:g} s, seed {self.seed}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClippedRow(WindowRow):
-    """A run with an amplifier that clips at the peak of a sine of rated power."""
-
-    known: str  # what the disturbance estimate knows of the amplifier, or what else is wrong
 
 
 def planned_runs() -> int:
@@ -117,21 +106,12 @@ def main(runs: Runs) -> StudyReport:
         claims=claims(rows, clipped, settled),
         figures=[_cases_figure(rows)],
         notes=parts.without_measured(pairs),
-        tables=[_summary_table(rows), _amplifier_table(clipped)],
+        tables=[_summary_table(rows), amplifier_table(clipped)],
         claims_heading="Aims",
     )
 
 
 # ---- Runs
-
-
-def _controller(scene: Scene, name: str, tuned: Settings, amplifier: Any = None) -> Any:
-    """Return a fresh controller, behind the limiter if its name says so."""
-    algorithm = name.removesuffix(" limited")
-    controller = bench.make_controller(scene, algorithm, tuned[name].setting, amplifier=amplifier)
-    if algorithm != name:
-        controller.limiter = OutputLimiter(scene.rated_power, fs=FS, window_s=WINDOW_S)
-    return controller
 
 
 def run_case(scene: Scene, case: Case, duration_s: float, seed: int, tuned: Settings) -> list[ConstraintRow]:
@@ -142,7 +122,7 @@ def run_case(scene: Scene, case: Case, duration_s: float, seed: int, tuned: Sett
         place = case.place | {"share": share, "seed": seed, "duration_s": duration_s}
         place["bound_db"], _ = cases.bounds_db(rated, case.stationary)
         for name in (*TUNED, *LIMITED):
-            figures = figures_of(rated.run(_controller(rated, name, tuned)), share)
+            figures = figures_of(rated.run(controller_of(rated, name, tuned)), share)
             rows.append(ConstraintRow(**place, algorithm=name, setting=tuned[name].setting, **figures))
     return rows
 
@@ -151,37 +131,10 @@ def convergence_times(scenes: Sequence[Scene], tuned: Settings) -> dict[str, flo
     """Return convergence times in seconds of KF-ANC and KF-PB, the NSE over 50 ms pooled over the scenes."""
     times = {}
     for name in ("KF-ANC", "KF-PB"):
-        results = [scene.run(_controller(scene, name, tuned)) for scene in scenes]
+        results = [scene.run(controller_of(scene, name, tuned)) for scene in scenes]
         errors, disturbances = (np.array([getattr(r, own) for r in results]) for own in ("error", "disturbance"))
         times[name] = convergence_time_s(errors, disturbances, FS, window_s=0.05, runs=True)
     return times
-
-
-def run_amplifiers(scene: Scene, primary: np.ndarray, case: Case, tuned: Settings) -> list[ClippedRow]:
-    """Run with an amplifier that clips: known, unknown or known wrongly; behind a limiter, with more that is wrong."""
-    limit = scene.amplitude_limit
-    clipping = replace(scene, amplifier=HardClipAmplifier(limit))
-    known = {
-        "unknown": None,
-        "known": HardClipAmplifier(limit),
-        "limit 20 % too high": HardClipAmplifier(1.2 * limit),
-        "limit 20 % too low": HardClipAmplifier(0.8 * limit),
-    }
-    jobs = [
-        (clipping, name, words, _controller(scene, name, tuned, amplifier))
-        for name in ("KF-ANC", "KF-OPC", "KF-PB")
-        for words, amplifier in known.items()
-    ]
-    wrong = replace(scene, secondary=path_taps(perturbed_path(scene.secondary, fs=FS, gain_db=6.0, phase_deg=45.0)))
-    begin_s, end_s = JUMP_S
-    jumping = cases.changing(clipping, primary, noise_level_db=[(0.0, 0.0), (begin_s, JUMP_DB), (end_s, 0.0)])
-    for name in LIMITED:
-        jobs.append((clipping, name, "path 6 dB, 45° off", _controller(wrong, name, tuned)))
-        jobs.append((jumping, name, f"{JUMP_DB:g} dB louder for a second", _controller(scene, name, tuned)))
-    return [
-        ClippedRow(**case.place, algorithm=name, known=words, **figures_of(at.run(controller), scene.rated_power))
-        for at, name, words, controller in jobs
-    ]
 
 
 # ---- Claims
@@ -262,19 +215,6 @@ def _summary_table(rows: Sequence[ConstraintRow]) -> Table:
         f"power over {1e3 * WINDOW_S:g} ms over the rated one",
         ["algorithm", "noise", "runs", "power", "below, mean", "below, worst", "worst window"],
         lines,
-    )
-
-
-def _amplifier_table(clipped: Sequence[ClippedRow]) -> Table:
-    return Table(
-        "amplifier",
-        "An amplifier that clips at the peak of a sine of rated power (25 %), and what the disturbance estimate knows of it",
-        ["paths", "noise", "algorithm", "amplifier or path", "noise reduction dB", "power", "worst 100 ms"],
-        [
-            [row.path, row.noise, row.algorithm, row.known]
-            + [cell(row, figure) for figure in ("noise_reduction_db", "power", "worst_window")]
-            for row in clipped
-        ],
     )
 
 

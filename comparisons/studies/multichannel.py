@@ -3,51 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, bench, noise_reduction_db, output_power
 from kfopc_filterpy._validate import how_to_install
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, Sound, StudyReport, Table, Tuned, algorithms
+from kfopc_filterpy.bench import FigureItem, Parameter, Runs, Scene, Sound, StudyReport, Table, Tuned, algorithms
 from kfopc_filterpy.plot import curve_style, plot_nse
 
 from . import multichannel_rooms as rooms
 from . import report_parts as parts
-from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Setting, bound_of
+from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Setting, bound_of, run_seeds
+from .multichannel_claims import BOUND, EQUAL, FREE, KF_PB, QUARTER, SCALED, ChannelRow, claims, rivals
 from .multichannel_rooms import MEASURED, RECORDINGS, Place, equally_rated, make_rated_scene, places
-from .rows import Row, column, figure_table, loss_claim, select, worst
+from .rows import column, figure_table, select
 
 DURATION_S, RECORDED_S = 8.0, 20.0  # a recording lasts for twice KF-PB's averaging time
-BOUND, SCALED, FREE = "bound", "scaled Wiener", "no limit"
-KF_PB = "KF-PB"
 DIRECT = ("KF-ANC", "KF-OPC")  # their state consists of all weights
 MOST_WEIGHTS = 256  # limit for them: a sample takes K J^2 L^2 operations
 SHOWN = ("4 x 4", "band noise")  # shown over time and in the map
-QUARTER, EQUAL = "a quarter each", "one equal rating"
 NSE_WINDOW_S = 0.25  # of the figure
 
 Results = dict[str, SimulationResult]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChannelRow(Row):
-    """One algorithm in one place; each power is that of a loudspeaker over its rated power, `power` the largest."""
-
-    rating: str = QUARTER
-    powers: list[float]
-    limited: list[bool] = field(default_factory=list)  # of the bound: whether the rating limits the loudspeaker
-
-    @property
-    def key(self) -> tuple[str, str, str]:
-        """Place, noise and rating."""
-        return self.path, self.noise, self.rating
-
-    @property
-    def within_ratings(self) -> bool:
-        """Whether every loudspeaker kept its rating."""
-        return self.power <= Tuned.BUDGET
 
 
 def cases() -> list[tuple[Place, str]]:
@@ -89,12 +67,13 @@ def main(runs: Runs) -> StudyReport | str:
     for place, noise in cases():
         scene = make_rated_scene(place, noise, RECORDED_S if noise in RECORDINGS else DURATION_S)
         best = bench.tune(runs, scene, names(place), trials=bench.try_settings(runs, scene, coarse_grids(place)))
-        results = final_runs(runs, scene, best)
+        finals = run_seeds(runs, scene, best, planned=False)
+        results = {name: result for name, [result] in finals.items() if result is not None}
         own = place_rows(place.name, noise, scene, best, results)
         rows += own
         tuned[f"{place.name}, {noise}"] = best
         if (place.name, noise) == SHOWN:
-            heard = [KF_PB, "FxLMS", *(row.algorithm for row in _rivals(own)[:2])]
+            heard = [KF_PB, "FxLMS", *(row.algorithm for row in rivals(own)[:2])]
             mapped = {name: results[name] for name in (heard[0], heard[2])}
             figures = [
                 _course_figure(own, {name: results[name] for name in heard}),
@@ -147,13 +126,6 @@ def main(runs: Runs) -> StudyReport | str:
 # ---- Runs
 
 
-def final_runs(runs: Runs, scene: Scene, tuned: Mapping[str, Tuned]) -> Results:
-    """Run every algorithm at its best setting; those that refuse it are left out."""
-    jobs = [(name, best.setting, 0) for name, best in tuned.items()]
-    finals = bench.run_settings(runs, scene, jobs, lambda result: result, planned=False)
-    return {name: result for name, result in zip(tuned, finals, strict=True) if result is not None}
-
-
 def place_rows(path: str, noise: str, scene: Scene, tuned: Mapping[str, Tuned], results: Results) -> list[ChannelRow]:
     """Return the rows of a place and noise; those with one equal rating are of the bounds and of KF-PB."""
     equal, place = equally_rated(scene), {"path": path, "noise": noise}
@@ -200,75 +172,6 @@ def _bound_rows(scene: Scene, *, noise: str, **place: Any) -> list[ChannelRow]:
         limited = output_power(signal, steady=1.0) > 0.995 * scene.rated_power
         rows.append(ChannelRow(**place, noise=noise, algorithm=label, **figures, limited=limited.tolist()))
     return rows
-
-
-# ---- Claims
-
-
-def claims(rows: Sequence[ChannelRow]) -> list[Claim]:
-    """Return the aims of KF-PB, and whether they are met."""
-    bound = {row.key: row for row in select(rows, algorithm=BOUND)}
-    pairs = [(row, bound[row.key]) for row in select(rows, algorithm=KF_PB)]
-    steady, recorded = ([pair for pair in pairs if (pair[0].noise in RECORDINGS) is own] for own in (False, True))
-
-    def losses(pairs: Sequence[tuple[ChannelRow, ChannelRow]]) -> dict[str, float]:
-        return {", ".join(own.key): bound.noise_reduction_db - own.noise_reduction_db for own, bound in pairs}
-
-    below = " below it"
-    found = [
-        _power_claim("Steady noise", "0.97 to 1.02", (0.97, 1.02), steady),
-        loss_claim("On steady noise KF-PB reaches the bound to within 0.5 dB", 0.5, losses(steady), below),
-    ]
-    if recorded:
-        text = "On recordings KF-PB reaches the bound of each second to within 1 dB"
-        found += [
-            _power_claim("Recordings", "at most 1.05", (0.0, 1.05), recorded),
-            loss_claim(text, 1.0, losses(recorded), below),
-        ]
-    return [*found, _rivals_claim(rows)]
-
-
-def _power_claim(
-    what: str, aim: str, span: tuple[float, float], pairs: Sequence[tuple[ChannelRow, ChannelRow]]
-) -> Claim:
-    """Judge the powers, above all of loudspeakers that their rating limits."""
-    powers = np.concatenate([own.powers for own, _ in pairs])
-    binding = powers[np.concatenate([bound.limited for _, bound in pairs])]
-    least, most = (np.min(binding), np.max(binding)) if binding.size else (np.nan, np.nan)
-    return Claim(
-        f"{what}: every loudspeaker's power is {aim} of its rating if that limits it, and never more",
-        bool(least >= span[0] and np.max(powers) <= span[1]),
-        f"{least:.3f} to {most:.3f} if the rating limits, {np.max(powers):.3f} at most of all",
-    )
-
-
-def _rivals_claim(rows: Sequence[ChannelRow]) -> Claim:
-    """Judge KF-PB against the best other method that keeps the ratings, for each place and noise with one."""
-    text = "No method of another kind that keeps every rating is more than 0.3 dB better"
-    own = select(rows, algorithm=KF_PB, rating=QUARTER)
-    behind = {}
-    for row in own:
-        rivals = _rivals([other for other in rows if other.key == row.key])
-        if rivals:
-            behind[f"{row.case}: {rivals[0].algorithm}"] = rivals[0].noise_reduction_db - row.noise_reduction_db
-    if not behind:
-        return Claim(text, False, "no other method keeps the ratings anywhere: nothing to compare with")
-    where, most = worst(behind)
-    alone = f"; in {len(own) - len(behind)} of {len(own)} cases no other keeps them" if len(behind) < len(own) else ""
-    return Claim(
-        text,
-        most <= 0.3,
-        f"KF-PB is {-np.mean(list(behind.values())):+z.2f} dB ahead of the best other on average, "
-        f"{-most:+z.2f} dB at worst ({where}), {-np.min(list(behind.values())):+z.2f} dB at best{alone}",
-    )
-
-
-def _rivals(rows: Sequence[ChannelRow]) -> list[ChannelRow]:
-    """Return the rows of algorithms with a constraint, without KF-PB's, that kept every rating; the best first."""
-    registry = algorithms(several_channels=True)
-    kept = [row for row in rows if row.algorithm in registry and row.algorithm != KF_PB and row.within_ratings]
-    constrained = [row for row in kept if registry[row.algorithm].keeps_budget]
-    return sorted(constrained, key=lambda row: -row.noise_reduction_db)
 
 
 # ---- Notes and tables

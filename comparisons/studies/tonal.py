@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from kfopc_filterpy.signals import tone
 
 from . import report_parts as parts
 from .cases import FS, PAPER, Setting, grid_runs, run_each
+from .weight_growth import Growth, growth_of
 
 KALMAN = ("KF-ANC", "KF-OPC")
 TONE_HZ = 400.0
@@ -34,9 +35,6 @@ HARMONICS_DB = -30.0  # over the disturbance; louder ones are harmonics, 3 % in 
 CLEAN_DB = -60.0  # softer ones are none: the sensor noise is as loud
 PEAK_SHARE = 1.01  # of the amplifier's limit
 POWER_TOLERANCE = 0.01
-MANY_TIMES = 10.0  # the optimal weight
-LINEAR_TOLERANCE = 0.1
-CONSTANT_TOLERANCE = 0.01
 
 
 def planned_runs() -> int:
@@ -149,35 +147,6 @@ def crossings_db(levels: np.ndarray, lead: np.ndarray) -> list[float]:
 
 
 # ---- Claims
-
-
-@dataclass(frozen=True)
-class Growth:
-    """How the largest weight of a control filter went on; all of it but `diverged_at_s` are ratios."""
-
-    over_optimal: float  # at the end, over the largest weight of the Wiener solution
-    over_half: float  # at the end, over half of the run
-    of_quarters: float  # gained in the last quarter, over what was gained in the second: 1 on a straight line
-    diverged_at_s: float | None = None
-
-    @property
-    def linear_without_bound(self) -> bool:
-        """Whether it grows in a straight line, and is far beyond the optimum."""
-        return self.over_optimal >= MANY_TIMES and abs(self.of_quarters - 1.0) <= LINEAR_TOLERANCE
-
-    @property
-    def none(self) -> bool:
-        """Whether it keeps its size."""
-        return abs(self.over_half - 1.0) <= CONSTANT_TOLERANCE
-
-
-def growth_of(result: SimulationResult, optimal_weight: float) -> Growth:
-    """Return how the largest weight of a run went on."""
-    assert result.weights is not None
-    largest = np.abs(result.weights).max(axis=1)
-    quarter, half, three, end = (float(largest[k * (largest.size - 1) // 4]) for k in (1, 2, 3, 4))
-    gained = (end - three) / (half - quarter) if half != quarter else np.inf
-    return Growth(end / optimal_weight, end / half, gained, result.diverged_at_s)
 
 
 def claims(

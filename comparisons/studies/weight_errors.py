@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from scipy.linalg import toeplitz
 
 from .cases import FS
+from .report_parts import MARK, thin_style
 
 WEIGHTS_EVERY = 4  # samples: 0.25 ms
 
@@ -36,3 +40,14 @@ def first_below_s(curve: np.ndarray, level_db: float) -> float | None:
     """Return the time at which a curve of weight errors first comes below a level; None if it does not."""
     below = np.flatnonzero(curve <= 10 ** (level_db / 10))
     return float(below[0] * WEIGHTS_EVERY / FS) if below.size else None
+
+
+def draw_weight_errors(ax: Any, curves: Mapping[str, np.ndarray], level_db: float) -> None:
+    """Draw the first half second of the curves of some algorithms, and a level."""
+    for name, curve in curves.items():
+        start = curve[: int(0.5 * FS / WEIGHTS_EVERY)]
+        time_ms = 1e3 * np.arange(start.size) * WEIGHTS_EVERY / FS
+        ax.semilogx(time_ms[1:], 10 * np.log10(start[1:]), **thin_style(name), label=name)
+    ax.axhline(level_db, color=MARK, linestyle=":")
+    ax.set(xlabel="Time (ms)", ylabel="Weight error (dB)")
+    ax.legend()
