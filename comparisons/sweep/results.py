@@ -17,7 +17,7 @@ from kfopc_filterpy._writing import replacing
 from kfopc_filterpy.bench import write_whole
 from kfopc_filterpy.plot import curve_style
 
-from ..studies.report_parts import MARK
+from ..studies.report_parts import MARK, new_figure
 from .grid import AXES, Grid
 from .scenario import Figures
 
@@ -114,22 +114,19 @@ def sweep_figure(grid: Grid, cells: Sequence[Record], names: Sequence[str]) -> F
 
     A cross at the bottom marks a cell with runs that diverged: its mean is over the others, if any.
     """
-    from matplotlib.figure import Figure
-
     x = swept_axis(grid)
     curves: dict[str, list[Record]] = {}
     for cell in cells:
         others = {name: cell[name] for name in grid.swept if name != x}
         words = [value if isinstance(value, str) else f"{name}={value}" for name, value in others.items()]
         curves.setdefault(", ".join(words) or "mean", []).append(cell)
-    figure = Figure(figsize=(6.4, 1.2 + 2.7 * len(names)), layout="constrained")
-    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    figure, axes = new_figure((6.4, 1.2 + 2.7 * len(names)), len(names), sharex=True)
+    panels = axes[:, 0]
     for ax, name in zip(panels, names, strict=True):
         for k, (label, own) in enumerate(islice(curves.items(), MOST_CURVES)):
             _curve(ax, own, name, x, curve_style(k) | {"label": label, "markersize": 4})
         ax.set_ylim(*np.clip(ax.get_ylim(), *LIMITS.get(name, (-math.inf, math.inf))))
         ax.set_ylabel(LABELS.get(name, name))
-        ax.grid(True, alpha=0.3)
     if x == "rated_power_db":
         ends = [min(grid.axes[x]), max(grid.axes[x])]
         panels[-1].plot(ends, ends, color=MARK, linewidth=1, linestyle=":", label="rated power")

@@ -17,14 +17,10 @@ from . import checked_steps
 from .covariance import RandomWalkCovariance, require_covariance
 from .kfopc import KFOPC
 
+# A filter's variances, and the results of its last update.
 NUMBERS = np.dtype(
     [(name, np.float64) for name in ("state_noise", "measurement_noise", "measurement", "residual", "variance")]
 )
-
-
-def new_numbers() -> np.ndarray:
-    """Return the record of a filter's variances and of the results of its last update."""
-    return np.array([(0.0, 0.0, 0.0, 0.0, np.nan)], NUMBERS)
 
 
 def _made_when_read(name: str, make: Callable[[Any], np.ndarray], description: str) -> Any:
@@ -108,7 +104,7 @@ class RandomWalkKFOPC(KFOPC):
         self._covariance = RandomWalkCovariance(np.eye(n_taps))
         self._K: np.ndarray | None = np.zeros((n_taps, 1))  # None: derived from the last update when read
         self._delegating = False
-        self._numbers = new_numbers()
+        self._numbers = np.array([(0.0, 0.0, 0.0, 0.0, nan)], NUMBERS)
         self._made: dict[str, Any] = {}  # those of y, z, S, SI and x_prior read or assigned since the last update
         super().__init__(n_taps, 1, rated_power=rated_power, constraint=constraint)
         self.state_noise = state_noise
