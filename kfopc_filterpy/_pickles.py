@@ -27,13 +27,14 @@ import scipy.linalg
 from filterpy.common import inv_diagonal
 from filterpy.kalman import KalmanFilter
 
+from .core.library import LINE
+
 FOLDERS = ("core", "paths", "power", "filters", "controllers", "realtime")  # whose classes can be named
 OUTSIDE = (KalmanFilter, inv_diagonal, np.linalg.inv, np.linalg.pinv, scipy.linalg.inv, scipy.linalg.pinv)  # and these
 MADE = (np.ndarray, np.random.Generator, deque, Counter)  # and these, which `_made` knows
 GENERATORS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")  # numpy's bit generators
 PLAIN = (type(None), bool, int, float, str)
 COPYING = ("__reduce__", "__reduce_ex__", "__setstate__")  # methods of a class for its own copying
-LINE = 64  # bytes in a cache line
 
 # Instructions that push a value, that push an empty one, and that take the last ones: so many, or for 0 back to a mark.
 BRING = ("BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8")

@@ -23,11 +23,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
-
 from . import _pickles
-from ._pickles import LINE
 from ._writing import replacing
+from .core.library import LINE, at_cache_line
 
 FORMAT = 2
 DIGEST = 64  # hexadecimal digits of SHA-256
@@ -175,8 +173,7 @@ def _read(path: Path) -> memoryview:
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}: look for it, or begin anew without a checkpoint")
     with open(path, "rb") as file:
-        room = np.empty(os.fstat(file.fileno()).st_size + LINE, np.uint8)
-        memory = room[-room.ctypes.data % LINE :][: room.size - LINE].data
+        memory = at_cache_line(os.fstat(file.fileno()).st_size).data
         memory = memory[: file.readinto(memory)]
     if not memory:
         raise CheckpointError(f"{path} is empty: nothing was saved in it; load an older file, or begin anew")

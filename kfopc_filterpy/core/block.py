@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .library import Field, Library, fields_of, load
+from .library import Field, Library, at_cache_line, fields_of, load
 
-ALIGNMENT = 64  # bytes; wide vectors are fastest there
 _STATE, _SETTING, _SCRATCH = range(3)
 _PRECISIONS: dict[str, np.dtype[Any]] = {"double": np.dtype(np.float64), "float": np.dtype(np.float32)}
 _VIEW_PLACES = 128
@@ -222,8 +221,7 @@ class Block:
         size = self._library.anc_size(*described)
         if not size:
             raise ValueError(f"a controller of this size cannot be made: {shape}")
-        room = np.zeros(size + ALIGNMENT, np.uint8)
-        self.memory = room[-room.ctypes.data % ALIGNMENT :][:size]
+        self.memory = at_cache_line(size)
         if memory is not None:
             if memory.size != size:
                 raise ValueError(f"the memory must have {size} bytes, got {memory.size}")

@@ -9,9 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from . import building
 
 LEVEL_VARIABLE = "KFOPC_CORE_LEVEL"
+LINE = 64  # bytes in a cache line
 _HOW = "build it from the clone: python -m pip install -e ."
 VISITOR = ctypes.PYFUNCTYPE(
     None,
@@ -71,6 +75,12 @@ def fields_of(describe: Callable[..., None], *what: Any) -> list[Field]:
 
     describe(*what, VISITOR(visit), None)
     return found
+
+
+def at_cache_line(n_bytes: int) -> NDArray[np.uint8]:
+    """Return zeros that begin at a cache line, where wide vectors are fastest."""
+    room = np.zeros(n_bytes + LINE, np.uint8)
+    return room[-room.ctypes.data % LINE :][:n_bytes]
 
 
 @functools.cache

@@ -6,72 +6,54 @@ P = scale (T - pending u u') + diagonal I, with the lower triangle T and u = P x
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 
 from .calls import covariance_describe, covariance_size
-from .calls import covariance_update as covariance_update
-from .library import fields_of
+from .library import at_cache_line, fields_of
 
 GROUP = 8  # rows of T that have one length, `PARTS` in vectors.h
-LINE = 64  # bytes in a cache line
 OWED = np.dtype(
     [(name, np.float64) for name in ("scale", "diagonal", "pending", "largest", "bound", "floored", "usual")]
 )
 
 
-class Covariance(NamedTuple):
-    """State covariance of n weights."""
-
-    memory: np.ndarray  # as the core lays it out; it begins at a cache line
-    result: np.ndarray  # (2,) innovation and S of the last update
-
-
 @cache
-def _fields(n: int) -> tuple[int, dict[str, slice]]:
-    """Return the size of the memory, and where its fields are, in numbers."""
+def _fields(n: int) -> dict[str, slice]:
+    """Return where the fields of a covariance of n weights are, in numbers."""
     ends = {field.name: (field.offset // 8, int(np.prod(field.shape))) for field in fields_of(covariance_describe, n)}
-    return covariance_size(n) // 8, {name: slice(begin, begin + size) for name, (begin, size) in ends.items()}
+    return {name: slice(begin, begin + size) for name, (begin, size) in ends.items()}
 
 
-DIRECTION = _fields(1)[1]["gain_direction"].start  # of every n: what stands before has a fixed size
+class Covariance:
+    """State covariance of n weights, made of a full symmetric array (n, n), whose upper triangle is not read."""
 
+    def __init__(self, P: np.ndarray) -> None:
+        self.n = len(P)
+        self.memory = at_cache_line(covariance_size(self.n)).view(np.float64)  # as the core lays it out
+        self.result = np.zeros(2)  # innovation and S of the last update
+        padded = -(-self.n // GROUP) * GROUP
+        full = np.zeros((padded, padded))
+        full[: self.n, : self.n] = np.tril(P) + np.tril(P, -1).T
+        for rows, group in _groups(self.triangle, self.n):
+            rows[...] = full[group : group + GROUP, : group + GROUP]
+        self.owed["scale"], self.owed["largest"] = 1.0, np.max(np.diagonal(P))
+        self.owed["bound"] = self.owed["largest"]
 
-def new_covariance(P: np.ndarray) -> Covariance:
-    """Return the covariance of a full symmetric array (n, n); the upper triangle is not read."""
-    n = len(P)
-    size, fields = _fields(n)
-    room = np.zeros(size + LINE // 8)
-    cov = Covariance(room[-(room.ctypes.data // 8) % (LINE // 8) :][:size], np.zeros(2))
-    padded = -(-n // GROUP) * GROUP
-    full = np.zeros((padded, padded))
-    full[:n, :n] = np.tril(P) + np.tril(P, -1).T
-    triangle = cov.memory[fields["triangle"]]
-    for rows, group in _groups(triangle, n):
-        rows[...] = full[group : group + GROUP, : group + GROUP]
-    owed = owed_of(cov)
-    owed["scale"], owed["largest"] = 1.0, np.max(np.diagonal(P))
-    owed["bound"] = owed["largest"]
-    return cov
+    @property
+    def owed(self) -> np.ndarray:
+        """Record of what is pending, a view, (1,)."""
+        return self.memory[: len(OWED.names or ())].view(OWED)
 
+    @property
+    def triangle(self) -> np.ndarray:
+        """T, a view."""
+        return self.memory[_fields(self.n)["triangle"]]
 
-def copy_covariance(cov: Covariance, n: int) -> Covariance:
-    """Return an independent copy (a plain array copy might not begin at a cache line)."""
-    other = new_covariance(np.zeros((n, n)))
-    for own, theirs in zip(other, cov, strict=True):
-        own[:] = theirs
-    return other
-
-
-def owed_of(cov: Covariance) -> np.ndarray:
-    """Return the record of what is pending, a view, (1,)."""
-    return cov.memory[: len(OWED.names or ())].view(OWED)
-
-
-def direction_of(cov: Covariance, n: int) -> np.ndarray:
-    """Return u, a view, (n,)."""
-    return cov.memory[DIRECTION : DIRECTION + n]
+    @property
+    def direction(self) -> np.ndarray:
+        """u, a view, (n,)."""
+        return self.memory[_fields(self.n)["gain_direction"]][: self.n]
 
 
 def full_covariance(triangle: np.ndarray, u: np.ndarray, scale: float, diagonal: float, weight: float) -> np.ndarray:
@@ -85,11 +67,6 @@ def full_covariance(triangle: np.ndarray, u: np.ndarray, scale: float, diagonal:
     P = P[:n, :n] * scale + weight * np.multiply.outer(u, u)
     P[np.diag_indices(n)] += diagonal
     return P
-
-
-def covariance_at(cov: Covariance, n: int, scale: float, diagonal: float, weight: float) -> np.ndarray:
-    """Return `full_covariance` of a covariance's present T and u."""
-    return full_covariance(cov.memory[_fields(n)[1]["triangle"]], direction_of(cov, n), scale, diagonal, weight)
 
 
 def _groups(triangle: np.ndarray, n: int) -> list[tuple[np.ndarray, int]]:

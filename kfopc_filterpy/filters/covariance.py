@@ -10,7 +10,8 @@ import numpy as np
 
 from .._validate import as_real_array, require_finite
 from ..core.calls import covariance_predict
-from ..core.triangle import Covariance, copy_covariance, covariance_at, new_covariance, owed_of
+from ..core.library import at_cache_line
+from ..core.triangle import Covariance, full_covariance
 from .checked_steps import INDEFINITE_LIMIT, require_semidefinite
 
 ASYMMETRY_LIMIT = 1e-8  # of the largest element: more than rounding can cause
@@ -32,10 +33,10 @@ class Seen(NamedTuple):
     result: int  # its last one
 
 
-class RandomWalkCovariance:
+class RandomWalkCovariance(Covariance):
     """P, P_prior and P_post of a random-walk filter, each expanded to a full array when read.
 
-    The core updates `arrays`. `prior` and `posterior` say how to compute P_prior and P_post from it, or are full arrays
+    The core updates `memory`. `prior` and `posterior` say how to compute P_prior and P_post from it, or are full arrays
     if that is no longer possible.
     """
 
@@ -43,8 +44,7 @@ class RandomWalkCovariance:
     passes = 0  # over the triangle, so far
 
     def __init__(self, P: np.ndarray) -> None:
-        self.n = len(P)
-        self.arrays: Covariance = new_covariance(0.5 * (P + P.T))
+        super().__init__(0.5 * (P + P.T))
         self.prior: Moment | np.ndarray = TRIANGLE
         self.posterior: Moment | np.ndarray = TRIANGLE
         # Arrays that `show` returned since the last step, newest last, each with a copy of what it held.
@@ -55,9 +55,9 @@ class RandomWalkCovariance:
         """Views and addresses, which are looked up once: that takes as long as a sample of a short filter."""
         if self._seen is None:
             weights, row = np.zeros((2, self.n))
-            memory, result = (array.ctypes.data for array in self.arrays)
+            memory, result = self.memory.ctypes.data, self.result.ctypes.data
             places = memory, self.n, weights.ctypes.data, row.ctypes.data
-            self._seen = Seen(owed_of(self.arrays), weights, row, places, result)
+            self._seen = Seen(self.owed, weights, row, places, result)
         return self._seen
 
     @property
@@ -70,7 +70,7 @@ class RandomWalkCovariance:
         """Return P at a moment, as a new full symmetric array."""
         if isinstance(moment, np.ndarray):
             return moment.copy()
-        return covariance_at(self.arrays, self.n, *moment)
+        return full_covariance(self.triangle, self.direction, *moment)
 
     def show(self) -> np.ndarray:
         """Return P as a new full array; values written into it take effect at the next step (see `edited`)."""
@@ -91,8 +91,9 @@ class RandomWalkCovariance:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RandomWalkCovariance:
         other = memo[id(self)] = object.__new__(type(self))
-        other.__dict__.update(deepcopy(self.__getstate__() | {"arrays": None}, memo))
-        other.arrays = copy_covariance(self.arrays, self.n)
+        other.__dict__.update(deepcopy(self.__getstate__() | {"memory": None}, memo))
+        other.memory = at_cache_line(self.memory.nbytes).view(np.float64)
+        other.memory[:] = self.memory
         return other
 
     def replaced(self, P: np.ndarray) -> RandomWalkCovariance:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .._validate import as_count, as_nonnegative, as_number, require_finite
 from ..core.block import LOUD_STEP, NO_SOLUTION
-from ..core.triangle import covariance_update, direction_of
+from ..core.calls import covariance_update
 from ..power.constraint import OutputPowerConstraint
 from . import checked_steps
 from .covariance import RandomWalkCovariance, require_covariance
@@ -240,7 +240,7 @@ class RandomWalkKFOPC(KFOPC):
     def K(self) -> np.ndarray:
         """Kalman gain of the last update, (n, 1)."""
         if self._K is None:  # eq. 6, K = P x' / S
-            u, S = direction_of(self._covariance.arrays, self.dim_x), self._numbers["variance"][0]
+            u, S = self._covariance.direction, self._numbers["variance"][0]
             self._K = (u / sqrt(S) if S > 0 else np.zeros_like(u)).reshape(-1, 1)
         return self._K
 
@@ -367,7 +367,7 @@ class RandomWalkKFOPC(KFOPC):
         if noise == 0.0 and not h.any():
             raise ValueError(checked_steps.SILENT_REFERENCE)
         before, prior = covariance.before_update()
-        result = covariance.arrays.result
+        result = covariance.result
         result[1] = nan
         answer = covariance_update(*seen.places, factor * z, noise, seen.result)
         y, S = result.tolist()
