@@ -19,6 +19,7 @@ from kfopc_filterpy import KFOPC
 from kfopc_filterpy._writing import replacing
 from kfopc_filterpy.bench import write_whole
 
+from ..studies.report_parts import new_figure
 from . import variants
 from .beside_filterpy import table_beside_filterpy, times_beside_filterpy
 
@@ -234,10 +235,8 @@ def real_time_taps(rows: list[dict[str, Any]], name: str, fs: float) -> int | No
 
 def figure(result: dict[str, Any]) -> Figure:
     """Draw the time of a sample against the taps, both logarithmic."""
-    from matplotlib.figure import Figure
-
-    drawing = Figure(figsize=(8.5, 5.5), layout="constrained")
-    ax = drawing.subplots()
+    drawing, axes = new_figure((8.5, 5.5))
+    ax = axes[0, 0]
     rows = result["rows"]
     for name in dict.fromkeys(row["variant"] for row in rows):
         taps, us = zip(*[(r["taps"], r["us_per_sample"]) for r in rows if r["variant"] == name], strict=True)
@@ -252,7 +251,6 @@ def figure(result: dict[str, Any]) -> Figure:
     ax.set(xlabel="taps L of the control filter", ylabel="time a sample (µs)", xticks=TAPS, xticklabels=TAPS)
     ax.minorticks_off()
     ax.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    ax.grid(alpha=0.3)
     return drawing
 
 

@@ -336,9 +336,14 @@ def suggested_constraint(
     """Return `constraint_for` at a sample rate, by default that of suggested settings if `n_taps` are such."""
     if constraint is not None and fs is not None:
         raise ValueError("fs belongs to rated_power: a constraint has its own, OutputPowerConstraint(..., fs=...)")
+    return constraint_for(rated_power, constraint, rate_of(n_taps, fs))
+
+
+def rate_of(n_taps: int | SuggestedSettings, fs: float | None) -> float:
+    """Return a sample rate in Hz, by default that of suggested settings if `n_taps` are such."""
     if fs is None:
-        fs = n_taps.fs if isinstance(n_taps, SuggestedSettings) else DEFAULT_FS
-    return constraint_for(rated_power, constraint, fs)
+        return n_taps.fs if isinstance(n_taps, SuggestedSettings) else DEFAULT_FS
+    return fs
 
 
 def at_suggested_rate(controller: _Made, n_taps: int | SuggestedSettings) -> _Made:

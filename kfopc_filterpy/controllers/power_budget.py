@@ -13,7 +13,7 @@ from ..power.amplifiers import Amplifiers
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import Limiters
 from .base import Looped
-from .kalman import at_suggested_rate
+from .kalman import at_suggested_rate, rate_of
 from .posterior import DEFAULT_UNCERTAINTY, PosteriorController, block_of, relative_spread
 
 DEFAULT_AVERAGING_S = 10.0
@@ -224,18 +224,15 @@ def kf_pb(
     >>> kf_pb(32, paths, rated_power=[0.5, 0.2])
     <KF-PB: 2 microphones, 2 loudspeakers, 1 reference, 32 taps, rated power 0.5, 0.2, constraint factor 1, 1>
     """
-    suggested = n_taps if isinstance(n_taps, SuggestedSettings) else None
-    if fs is None:
-        fs = DEFAULT_FS if suggested is None else suggested.fs
     controller = PowerBudgetController(
-        n_taps if suggested is None else suggested.n_taps,  # type: ignore[arg-type]
+        n_taps.n_taps if isinstance(n_taps, SuggestedSettings) else n_taps,
         secondary_path,
         rated_power=rated_power,
         n_references=n_references,
         amplifier=amplifier,
         limiter=limiter,
         secondary_path_uncertainty=secondary_path_uncertainty,
-        fs=fs,
+        fs=rate_of(n_taps, fs),
         averaging_s=averaging_s,
     )
     return at_suggested_rate(controller, n_taps)
