@@ -51,6 +51,13 @@ def as_real_array(value: Any, name: str) -> np.ndarray:
     return real
 
 
+def as_finite_array(value: Any, name: str) -> np.ndarray:
+    """Return `value` as a float64 array of any shape without NaN and Inf."""
+    array = as_real_array(value, name)
+    require_finite(array, name)
+    return array
+
+
 def _may_be_real(array: np.ndarray) -> bool:
     """Return False for what numpy would take: complex numbers without their imaginary part, text, dates, masks."""
     if array.dtype.kind != "O":

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._types import PathModels
-from .._validate import as_choice, as_positive, as_real_array, per_loudspeaker, require_finite
+from .._validate import as_choice, as_finite_array, as_positive, per_loudspeaker
 from ..paths.path_matrix import is_path_matrix
 from .channel_bound import ChannelCorrelations, channel_record
 from .wiener import reduction_db
@@ -143,8 +143,7 @@ def _control_power(value: Any) -> Any:
     """Return a positive number, or powers (J,) of which at least one is positive."""
     if np.ndim(value) != 1:
         return as_positive(value, "control_power")
-    powers = as_real_array(value, "control_power")
-    require_finite(powers, "control_power")
+    powers = as_finite_array(value, "control_power")
     if np.any(powers < 0) or not np.any(powers > 0):
         raise ValueError(f"control_power must not be negative, and at least one must be greater than 0, got {powers}")
     return powers
@@ -152,8 +151,7 @@ def _control_power(value: Any) -> Any:
 
 def _wanted(noise_reduction_db: Any) -> np.ndarray:
     """Return the noise reductions wanted, finite and not negative."""
-    wanted = as_real_array(noise_reduction_db, "noise_reduction_db")
-    require_finite(wanted, "noise_reduction_db")
+    wanted = as_finite_array(noise_reduction_db, "noise_reduction_db")
     if np.any(wanted < 0):
         raise ValueError(f"noise_reduction_db must not be negative, got {wanted.min():g} dB")
     return wanted

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .._types import NumberOrArray
-from .._validate import as_real_array, require_finite
+from .._validate import as_finite_array
 from ..power.limiter import OutputLimiter
 from .base import Controller, WrappedController, listening
 from .core_controller import CoreController
@@ -72,7 +72,7 @@ class LimitedController(WrappedController):
 
     def control_signal(self, reference: float) -> float:
         """Return the limited control signal y(n) for the newest reference sample x(n)."""
-        require_finite(as_real_array(reference, "reference"), "reference")
+        as_finite_array(reference, "reference")
         y = self.controller.control_signal(reference)
         if not np.isfinite(y):  # a divergence: return it, so that the loop detects it
             return y
@@ -84,7 +84,7 @@ class LimitedController(WrappedController):
 
     def update(self, error: NumberOrArray) -> None:
         """Pass the error e(n) to the controller's `update`."""
-        require_finite(as_real_array(error, "error"), "error")
+        as_finite_array(error, "error")
         super().update(error)
 
     def _rates(self) -> dict[str, float | None]:

@@ -11,7 +11,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike
 
-from .._validate import as_number, as_real_array, require_finite
+from .._validate import as_finite_array, as_number, as_real_array, require_finite
 
 INDEFINITE_LIMIT = 1e-8  # of the largest element: a more negative eigenvalue of P is not rounding
 
@@ -147,7 +147,7 @@ def checked_measurement(
     row = np.reshape(given, (1, -1)) if np.ndim(given) < 2 else np.asarray(given)
     if row.ndim != 2 or row.shape[1] != n:
         raise ValueError(f"H must have shape ({n},) or (dim_z, {n}), got {np.shape(given)}")
-    require_finite(as_real_array(row, "H"), "H")
+    as_finite_array(row, "H")
     rows = len(row)
     require_measurement(z, rows)
     noise = kf.R if R is None else R
@@ -198,7 +198,7 @@ def require_control(kf: KalmanFilter, u: ArrayLike | None, B: ArrayLike | None) 
     passed = kf.B if B is None else B
     if u is not None and passed is not None:
         for name, value in {"u": u, "B": passed}.items():
-            require_finite(as_real_array(value, name), name)
+            as_finite_array(value, name)
 
 
 def without_masked(kf: KalmanFilter, z: np.ma.MaskedArray, R: Any, H: Any) -> tuple[Any, Any, Any, np.ndarray | None]:
@@ -252,7 +252,7 @@ def require_matrix(value: ArrayLike, shape: tuple[int, ...], name: str) -> None:
     """Raise ValueError unless `value` is finite and has this shape."""
     if np.shape(value) != shape:
         raise ValueError(f"{name} must have shape {shape}, got {np.shape(value)}")
-    require_finite(as_real_array(value, name), name)
+    as_finite_array(value, name)
 
 
 def require_variance(value: ArrayLike, size: int, name: str) -> None:
@@ -260,13 +260,13 @@ def require_variance(value: ArrayLike, size: int, name: str) -> None:
     if np.ndim(value) > 0 and np.size(value) > 1:
         require_matrix(value, (size, size), name)
     else:
-        require_finite(as_real_array(value, name), name)
+        as_finite_array(value, name)
     if np.min(np.diagonal(value) if np.ndim(value) == 2 else value) < 0:
         raise ValueError(f"{name} must not be negative: it is a variance, got {value!r}")
 
 
-def require_semidefinite(value: ArrayLike, name: str, limit: float = INDEFINITE_LIMIT) -> None:
-    """Raise ValueError if the covariance `value` has an eigenvalue below -`limit` times its largest element.
+def require_semidefinite(value: ArrayLike, name: str) -> None:
+    """Raise ValueError if the covariance `value` has an eigenvalue below -`INDEFINITE_LIMIT` times its largest element.
 
     NaN, Inf and wrong shapes pass: the step that uses them refuses them.
     """
@@ -277,7 +277,7 @@ def require_semidefinite(value: ArrayLike, name: str, limit: float = INDEFINITE_
     if not 0.0 < largest < np.inf:  # NaN is not
         return
     scaled = 0.5 * (P / largest + P.T / largest)  # overflows nowhere
-    if not _is_definite(scaled + limit * np.eye(len(P))):
+    if not _is_definite(scaled + INDEFINITE_LIMIT * np.eye(len(P))):
         smallest = largest * np.linalg.eigvalsh(scaled)[0]
         raise ValueError(
             f"{name} must be positive semidefinite: it is a covariance, but its smallest eigenvalue is {smallest:g}. "

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_real_array, require_finite
+from .._validate import as_real_array
 from ..core.calls import covariance_predict
 from ..core.library import at_cache_line
 from ..core.triangle import Covariance, full_covariance
-from .checked_steps import INDEFINITE_LIMIT, require_semidefinite
+from .checked_steps import require_matrix, require_semidefinite
 
 ASYMMETRY_LIMIT = 1e-8  # of the largest element: more than rounding can cause
 LARGEST = float(np.finfo(np.float64).max)
@@ -159,15 +159,13 @@ def require_covariance(P: np.ndarray, name: str = "P") -> None:
     if difference.max() > ASYMMETRY_LIMIT * np.abs(P).max():
         i, j = np.unravel_index(np.argmax(difference), P.shape)
         raise ValueError(f"{name} must be symmetric, but [{i}, {j}] holds {P[i, j]:g} and [{j}, {i}] {P[j, i]:g}")
-    require_semidefinite(P, name, INDEFINITE_LIMIT)
+    require_semidefinite(P, name)
 
 
 def as_semidefinite(value: Any, size: int, name: str) -> np.ndarray:
     """Return a symmetric, positive semidefinite matrix (size, size), or raise a clear error."""
     matrix = as_real_array(value, name)
-    if matrix.shape != (size, size):
-        raise ValueError(f"{name} must have shape ({size}, {size}), got {matrix.shape}")
-    require_finite(matrix, name)
+    require_matrix(matrix, (size, size), name)
     try:
         require_covariance(matrix, name)
     except ValueError as error:

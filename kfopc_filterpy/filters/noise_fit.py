@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validate import as_real_array, require_finite
+from .._validate import as_finite_array, as_real_array, require_finite
 from .covariance import as_semidefinite
 
 STEP = 1e-3  # of log-variances, for derivatives: see the notes of `fit_noise`
@@ -189,17 +189,15 @@ class _Record:
     def __init__(self, kf: Any, z: Any, H: Any) -> None:
         if getattr(kf, "alpha", 1.0) != 1.0:
             raise ValueError(f"kf.alpha must be 1, got {kf.alpha:g}: a fading memory is no model with a likelihood")
-        self.x, self.F = as_real_array(kf.x, "kf.x").ravel(), as_real_array(kf.F, "kf.F")
+        self.x, self.F = as_finite_array(kf.x, "kf.x").ravel(), as_finite_array(kf.F, "kf.F")
         n = self.x.size
         self.P = as_semidefinite(kf.P, n, "kf.P")
-        self.H = np.atleast_2d(as_real_array(kf.H if H is None else H, "H"))
+        self.H = np.atleast_2d(as_finite_array(kf.H if H is None else H, "H"))
         if self.F.shape != (n, n) or self.H.ndim > 3 or self.H.shape[-1] != n:
             raise ValueError(
                 f"F must be ({n}, {n}) and H (dim_z, {n}) or (n_samples, dim_z, {n}) for a filter of {n} states, "
                 f"got F {self.F.shape} and H {self.H.shape}"
             )
-        for name in ("x", "F", "H"):
-            require_finite(getattr(self, name), name)
         if not self.H.any():
             raise ValueError("H must not be zero: it says what is measured; assign kf.H or pass H=")
         self.z, self.there = _measured(z, self.H.shape[-2])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validate import as_count, as_nonnegative, as_number, require_finite
+from .._validate import as_count, as_nonnegative, as_number
 from ..core.block import LOUD_STEP, NO_SOLUTION
 from ..core.calls import covariance_update
 from ..power.constraint import OutputPowerConstraint
@@ -191,9 +191,7 @@ class RandomWalkKFOPC(KFOPC):
 
     def _matrix(self, value: Any, name: str) -> np.ndarray:
         matrix = np.array(value, dtype=np.float64)
-        if matrix.shape != (self.dim_x, self.dim_x):
-            raise ValueError(f"{name} must have shape ({self.dim_x}, {self.dim_x}), got {matrix.shape}")
-        require_finite(matrix, name)
+        checked_steps.require_matrix(matrix, (self.dim_x, self.dim_x), name)
         return matrix
 
     _I = _Identity()

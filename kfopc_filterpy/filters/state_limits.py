@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validate import as_positive, as_real_array, require_finite
+from .._validate import as_finite_array, as_positive, as_real_array
 from .covariance import as_semidefinite
 
 ROUNDING = 1e-12  # eigenvalues of a correlation matrix, and slopes of limits, below this are taken as zero
@@ -96,11 +96,10 @@ def constrained(
     >>> print(round(float(nearest @ nearest), 9))
     9.0
     """
-    estimate = as_real_array(kf.x, "kf.x")
+    estimate = as_finite_array(kf.x, "kf.x")
     n = estimate.size
     if estimate.shape not in ((n,), (n, 1)):
         raise ValueError(f"kf.x must have shape (n,) or (n, 1), got {estimate.shape}")
-    require_finite(estimate, "kf.x")
     P = as_semidefinite(kf.P, n, "kf.P")
     centre, deviations = estimate.ravel(), np.sqrt(np.diagonal(P))
     D, d = _in_deviations(*_rows(equalities, n, "equalities"), centre, deviations)
@@ -145,15 +144,13 @@ def _rows(pair: Any, n: int, name: str) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((0, n)), np.zeros(0)
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise TypeError(f"{name} must be a pair of a matrix (m, {n}) and values (m,), got {type(pair).__name__}")
-    matrix, values = as_real_array(pair[0], f"{name}[0]"), as_real_array(pair[1], f"{name}[1]")
-    matrix, values = np.atleast_2d(matrix), np.atleast_1d(values)
+    matrix = np.atleast_2d(as_finite_array(pair[0], f"{name}[0]"))
+    values = np.atleast_1d(as_finite_array(pair[1], f"{name}[1]"))
     if matrix.ndim != 2 or matrix.shape[1] != n or values.shape != (len(matrix),):
         raise ValueError(
             f"{name} must be a matrix (m, {n}) and values (m,), got shapes {matrix.shape} and {values.shape}; "
             "give one row and one value for each limit"
         )
-    require_finite(matrix, f"{name}[0]")
-    require_finite(values, f"{name}[1]")
     return matrix, values
 
 
