@@ -163,7 +163,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         before = self._W
         if self._taken.any():
             self._adapt()
-        if np.abs(self._W.view(float)).max() > MOST_WEIGHT:
+        if not np.abs(self._W.view(float)).max() <= MOST_WEIGHT:  # NaN is not
             self._W = before
         self._errors[:], self._taken[:], self._n = 0.0, False, 0
         # The next block: its own samples are zero as yet.
@@ -174,8 +174,17 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
 
     # Samples.
 
-    def _emit(self, x: np.ndarray) -> np.ndarray:
-        """Return the control signals for samples (I, n) that lie within a block, (J, n)."""
+    @property
+    def samples_left(self) -> int:
+        """Samples until the present block ends, or the next one if it has just ended."""
+        return self.block_size - self._n % self.block_size
+
+    def emit(self, x: np.ndarray, limit: np.ndarray | None = None) -> np.ndarray:
+        """Return the control signals (J, n) for references (I, n) of at most `samples_left` samples.
+
+        They end before the first sample that is not within a `limit` (J, 1), unless this is their first one.
+        """
+        require_moderate(x, "reference")
         if self._n == self.block_size:  # the error of its last sample was not taken
             self._end_block()
         begin, end = self._n, self._n + x.shape[1]
@@ -184,9 +193,22 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         for j, filters in enumerate(self._first_taps):
             for i, taps in enumerate(filters):
                 y[j] += np.correlate(self._now[i, begin : end + self.block_size - 1], taps, "valid")
+        if limit is not None:
+            within = np.all(np.abs(y) <= limit, axis=0)
+            end = end if within.all() else begin + max(int(np.argmin(within)), 1)
+            y = y[:, : end - begin]
         self._played[:, begin:end] = y
         self._n = end
         return y
+
+    def take(self, errors: np.ndarray, taken: ArrayLike = True) -> None:
+        """Take the errors (K, n) that the last n control signals left; `taken` says to which of them to adapt, (n,)."""
+        require_moderate(errors, "error", LOUDEST_ERROR)
+        here = slice(self._n - errors.shape[1], self._n)
+        self._taken[here] = taken
+        self._errors[:, here] = np.where(self._taken[here], errors, 0.0)
+        if self._n == self.block_size and self._taken[-1]:
+            self._end_block()
 
     def emitted(self, control_signal: float) -> None:
         """Take `control_signal`, to which a limiter changed the last one; `LimitedController` calls this."""
@@ -198,19 +220,15 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         With several channels, x(n) is (I,) and y(n) is (J,).
         """
         x = self._sample(reference, "reference", "references")
-        require_moderate(x, "reference")
-        y = self._emit(np.reshape(x, (-1, 1)))[:, 0]
+        y = self.emit(np.reshape(x, (-1, 1)))[:, 0]
         return y if self.multichannel else float(y[0])
 
     def update(self, error: NumberOrArray) -> None:
         """Take the error e(n), with several channels (K,), that the last control signal left; adapt after B samples."""
         e = self._sample(error, "error", "microphones")
-        require_moderate(e, "error", LOUDEST_ERROR)
         if self._n == 0:
             raise ValueError("update must follow the control_signal of its sample, but a new block has just begun")
-        self._errors[:, self._n - 1], self._taken[self._n - 1] = e, True
-        if self._n == self.block_size:
-            self._end_block()
+        self.take(np.reshape(e, (-1, 1)))
 
     def process(
         self,
@@ -225,27 +243,20 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         x = self._block_signal(references, "references", self.n_references)
         e = self._block_signal(errors, "errors", self.n_microphones)
         loud = np.abs(x).max() > LOUDEST or np.abs(e).max() > LOUDEST_ERROR
-        if loud or calls_of(type(self)) != calls_of(BlockController):
+        if loud or not runs_in_blocks(self):
             return super().process(x, e, adapt=adapt, out=out)  # up to the sample that is refused
         require_one_length(x, e)
         flags = adapt_flags(adapt, x.shape[-1])
         require_apart(out, x, e)
         y = output_array(out, (self.n_loudspeakers, x.shape[1]) if self.multichannel else x.shape)
-        self._run(np.atleast_2d(x), np.atleast_2d(e), flags, np.atleast_2d(y))
+        begin, signals = 0, [np.atleast_2d(signal) for signal in (x, e, y)]
+        while begin < flags.size:
+            part = slice(begin, begin + self.samples_left)
+            references, errors, out_part = (signal[:, part] for signal in signals)
+            out_part[:] = self.emit(references)
+            self.take(errors, flags[part])
+            begin = part.stop
         return y
-
-    def _run(self, x: np.ndarray, e: np.ndarray, flags: np.ndarray, y: np.ndarray) -> None:
-        """Do what the two methods do for each sample, stretch by stretch of the blocks."""
-        begin, n_samples = 0, x.shape[1]
-        while begin < n_samples:
-            end = min(begin + self.block_size - self._n % self.block_size, n_samples)
-            part = slice(begin, end)
-            y[:, part] = self._emit(x[:, part])
-            here = slice(self._n - (end - begin), self._n)
-            self._errors[:, here], self._taken[here] = np.where(flags[part], e[:, part], 0.0), flags[part]
-            if self._n == self.block_size and flags[end - 1]:
-                self._end_block()
-            begin = end
 
     def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Follow the noise before the control is switched on, while the loudspeakers are silent; the weights stay.
@@ -267,3 +278,8 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
     def __repr__(self) -> str:
         parts = f"{self.n_partitions} partition{'s' if self.n_partitions > 1 else ''} of {self.partition_size}"
         return f"<{self.name}: {self.n_taps} taps in {parts}, blocks of {self.block_size} samples>"
+
+
+def runs_in_blocks(controller: object) -> bool:
+    """Return whether a controller keeps its control filter for a block, and no subclass changes what a sample does."""
+    return isinstance(controller, BlockController) and calls_of(type(controller)) == calls_of(BlockController)

@@ -106,6 +106,8 @@ class FrequencyDomainKalman(FrequencyDomainFxLMS):
         anti_noise = irfft(rfft(self._emitted) * self._S[0, 0], self._window)[:, -self.block_size :]
         error = self._errors + anti_noise - self._block_of(np.sum(W * X, axis=0))
         E = self._block_spectrum(np.where(self._taken, error, 0.0))
+        if not E.any():  # the sound is still under way: a noise of zero would make P zero for good
+            return
         self._noise = self._averaged(self._noise, np.abs(E[0]) ** 2)
         P *= self.transition**2
         P += (1.0 - self.transition**2) * np.abs(W) ** 2

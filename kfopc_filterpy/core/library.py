@@ -33,7 +33,7 @@ _CALLS = {
     "listen": "qPPPPPqP",
     "run": "qPPPPiqqP",
     "hear": "-PPq",
-    "play": "-PPPq",
+    "play": "-PPqq",
     "process": "qPiiiPPPPqqqPP",
     "preview": "-PPPiPrrr",
     "commit": "-PPPiPrrr",

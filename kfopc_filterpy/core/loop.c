@@ -12,8 +12,7 @@ void anc_hear(anc_plant *p, const anc_signals *s, int64_t n)
     }
 }
 
-/* Send the amplifiers' outputs through the paths: a = s * y_amp and e = d - a + sensor noise. */
-void anc_play(anc_plant *p, const real *amplified, const anc_signals *s, int64_t n)
+static void play(anc_plant *p, const anc_signals *s, int64_t n)
 {
     const int32_t taps = p->path_taps > p->feedback_taps ? p->path_taps : p->feedback_taps;
     const int32_t before = p->at;
@@ -21,7 +20,7 @@ void anc_play(anc_plant *p, const real *amplified, const anc_signals *s, int64_t
     for (int32_t sj = 0; sj < p->scenarios * p->loudspeakers; sj++) {
         real *row = p->output + times(sj, p->length);
         if (!before) memcpy(row + p->at + 1, row, sizeof(real) * (size_t)(taps - 1));
-        row[p->at] = s->amplifier_output[sj * s->length + n] = amplified[sj];
+        row[p->at] = s->amplifier_output[sj * s->length + n];
     }
     for (int32_t scenario = 0; scenario < p->scenarios; scenario++)
         for (int32_t k = 0; k < p->microphones; k++) {
@@ -33,6 +32,12 @@ void anc_play(anc_plant *p, const real *amplified, const anc_signals *s, int64_t
             s->anti_noise[at] = a;
             s->error[at] = p->error[sk] = s->disturbance[at] - a + (s->sensor_noise ? s->sensor_noise[at] : 0);
         }
+}
+
+/* Send the amplifiers' outputs through the paths: a = s * y_amp and e = d - a + sensor noise. */
+void anc_play(anc_plant *p, const anc_signals *s, int64_t begin, int64_t end)
+{
+    for (int64_t n = begin; n < end; n++) play(p, s, n);
 }
 
 static void write_down(const anc_record *r, int64_t n)
@@ -57,9 +62,9 @@ int64_t anc_run(const anc_controller *c, anc_plant *p, const anc_signals *s, con
             if (!within(p->control[sj], p->limit[sj])) return n;
         for (int32_t sj = 0; sj < loudspeakers; sj++) {
             s->control_signal[sj * s->length + n] = p->control[sj];
-            p->control[sj] = anc_amplify(p->amplifiers + sj, p->control[sj]);
+            s->amplifier_output[sj * s->length + n] = anc_amplify(p->amplifiers + sj, p->control[sj]);
         }
-        anc_play(p, p->control, s, n);
+        play(p, s, n);
         *status = ANC_REFUSED_ERROR;
         if (c->update(c->self, p->error)) return n;
         for (int32_t r = 0; r < n_records; r++) write_down(records + r, n);

@@ -158,17 +158,17 @@ class Plant:
         return self.reference
 
     def amplified(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the outputs of the amplifier models for control signals, (J,)."""
-        y, out = np.ascontiguousarray(y), np.empty(y.size)
-        for j in range(y.size):
-            amplify_all(self.amplifiers[j].ctypes.data, y[j:].ctypes.data, out[j:].ctypes.data, 1)
+        """Return the outputs of the amplifier models for control signals, (J, n)."""
+        y = np.ascontiguousarray(y)
+        out = np.empty_like(y)
+        for model, one, other in zip(self.amplifiers, y, out, strict=True):
+            amplify_all(model.ctypes.data, one.ctypes.data, other.ctypes.data, one.size)
         return out
 
-    def play(self, amplified: NDArray[np.float64], signals: Signals, n: int) -> NDArray[np.float64]:
-        """Send the amplifiers' outputs, (J,), through the paths; return the errors of sample n, (K,)."""
-        self.control[:] = amplified
-        _library.anc_play(ctypes.byref(self._struct), self.control.ctypes.data, self._pointers(signals), n)
-        return self.error
+    def play(self, signals: Signals, begin: int, end: int) -> NDArray[np.float64]:
+        """Send the amplifiers' outputs of the samples from `begin` to `end` through the paths; return the errors, (K, n)."""
+        _library.anc_play(ctypes.byref(self._struct), self._pointers(signals), begin, end)
+        return signals.error[:, begin:end]
 
 
 def process(

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from .._types import ChangingPaths, PerLoudspeaker, Seed
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
+from ..controllers.block import runs_in_blocks
 from ..controllers.base import Controller, Looped, checked_controller, differing_counts, listening
 from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..controllers.processing import takes_none
@@ -215,11 +216,11 @@ def simulate(
         several,
         progress,
     )
-    looped = None
-    if compiled and isinstance(controller, CoreController) and not any(any(own) for own, _ in amplifiers.values):
-        looped = controller.looped()
+    compiled = compiled and not any(any(own) for own, _ in amplifiers.values)
+    looped = controller.looped() if compiled and isinstance(controller, CoreController) else None
+    in_blocks = compiled and runs_in_blocks(controller) and not feedback.values[0].size
     with getattr(controller, "in_use", nullcontext()):
-        diverged, end = run.steps(x) if looped is None else run.loop(looped)
+        diverged, end = run.loop(looped) if looped else run.blocks(x) if in_blocks else run.steps(x)
     for signal in (*results, *recorded.values()):
         signal[:, end:] = np.nan
     weights[-(-end // (every or 1)) :] = np.nan
@@ -300,9 +301,7 @@ class _Run:
                 y = self._control_signal(self.plant.hear(self.signals, n))
                 if not np.all(np.abs(y) <= self.plant.limit):
                     return True, n
-                error = self.plant.play(self._amplified(y), self.signals, n)
-                self.signals.control_signal[:, n] = y
-                self.controller.update(self._sample(error))
+                self.controller.update(self._sample(self._errors(y[:, None], n)[:, 0]))
             for name, signal in self.recorded.items():
                 signal[:, n] = getattr(self.controller, name, np.nan)
             if len(self.weights) and n % self.every == 0:
@@ -310,6 +309,28 @@ class _Run:
             if self.progress:
                 self.progress(1)
         return False, x.shape[1]
+
+    def blocks(self, x: np.ndarray) -> tuple[bool, int]:
+        """Run a controller that keeps its control filter for a block, as `steps` does, by stretches within its blocks."""
+        begin, changes, n_samples, limit = 0, 0, x.shape[1], self.plant.limit[:, None]
+        while begin < n_samples:
+            if begin == changes:
+                changes = self.set_plant(begin)
+            row = -(-begin // self.every)  # of the next weights that are recorded
+            noted = row * self.every + 1 if len(self.weights) else n_samples + 1
+            end = min(begin + self.controller.samples_left, changes, noted, n_samples)
+            with naming_sample(begin):
+                y = self.controller.emit(x[:, begin:end], limit)
+                if not np.all(np.abs(y[:, 0]) <= limit[:, 0]):
+                    return True, begin
+                self.controller.take(self._errors(y, begin))
+            end = begin + y.shape[1]
+            if end == noted:
+                self.weights[row] = np.reshape(filters_of(self.controller), self.weights.shape[1:])
+            if self.progress:
+                self.progress(end - begin)
+            begin = end
+        return False, n_samples
 
     def _sample(self, values: np.ndarray) -> Any:
         """Return a sample as the controller takes it: a number, an array of several channels, or None of no channel."""
@@ -328,15 +349,18 @@ class _Run:
             )
         return y
 
-    def _amplified(self, y: np.ndarray) -> np.ndarray:
-        """Return the amplifiers' outputs, (J,)."""
-        amplified = self.plant.amplified(y)
+    def _errors(self, y: np.ndarray, n: int) -> np.ndarray:
+        """Return the errors (K, samples) that control signals (J, samples) leave from sample n on."""
+        amplified, end = self.plant.amplified(y), n + y.shape[1]
         for j, function in enumerate(self.functions):
-            if function is not None:
-                amplified[j] = _as_sample(function(float(y[j])), "amplifier")
-                if not np.isfinite(amplified[j]):
-                    raise ValueError(f"amplifier must return a finite number, got {amplified[j]} for {y[j]}")
-        return amplified
+            if function is not None:  # then y is one sample
+                amplified[j] = _as_sample(function(float(y[j, 0])), "amplifier")
+                if not np.isfinite(amplified[j, 0]):
+                    raise ValueError(f"amplifier must return a finite number, got {amplified[j, 0]} for {y[j, 0]}")
+        self.signals.amplifier_output[:, n:end] = amplified
+        errors = self.plant.play(self.signals, n, end)
+        self.signals.control_signal[:, n:end] = y
+        return errors
 
 
 def is_multichannel(

@@ -12,7 +12,7 @@ import pytest
 from helpers.channels import random_paths
 from helpers.checkpoints import Room
 from helpers.comparing import assert_same_run, numbers_of
-from helpers.controllers import ALL, MAKERS, PATHS, SEVERAL, VARIANTS, I, J, K, made
+from helpers.controllers import ALL, IN_BLOCKS, MAKERS, PATHS, SEVERAL, VARIANTS, I, J, K, made
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, N_TAPS, noises, run
 
 import kfopc_filterpy
@@ -57,6 +57,34 @@ def test_so_it_is_with_several_channels(name: str) -> None:
     assert_same_run(*both)
     np.testing.assert_array_equal(fast.weights, slow.weights)
     assert_same_run(*(simulate(one, x[:, :50], compiled=one is slow, **options) for one in (fast, slow)))
+
+
+@pytest.mark.parametrize("name", IN_BLOCKS)
+def test_a_run_by_blocks_is_the_steps_bit_for_bit(name: str) -> None:
+    """Also if the path changes within a block, if weights are recorded, and if it ends in a divergence."""
+    path, several = IN_BLOCKS[name]().secondary_path, "many" in name
+    rng = np.random.default_rng(5)
+    x, d = rng.standard_normal((2, I, 200)), rng.standard_normal((2, K, 200))
+    if not several:
+        x, d = x[:, 0], d[:, 0]
+    options: dict[str, Any] = {"secondary_path": [(0.0, path), (40 / FS, 0.9 * path)], "fs": FS, "sensor_noise_std": 0.1}
+    options |= {"amplifier": AMPLIFIERS["soft"][0], "record_weights_every": 5, "switch_on_s": 3 / FS, "rng": 1}
+
+    def both(rated_power: float) -> Any:
+        made = [IN_BLOCKS[name]() for _ in range(2)]
+        runs = [
+            [simulate(one, x[k], disturbance=d[k], rated_power=rated_power, compiled=k == i, **options) for k in (0, 1)]
+            for i, one in enumerate(made)
+        ]
+        for one, other in zip(*runs, strict=True):
+            assert_same_run(one, other)
+        np.testing.assert_array_equal(made[0].weights, made[1].weights)
+        return runs[0][0]
+
+    result = both(1.0)
+    assert result.diverged_at_s is None
+    peak = np.abs(result.control_signal).max()
+    assert both(float((0.9e-6 * peak) ** 2)).diverged_at_s > 0  # a run stops at 1e6 sqrt(rated_power)
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if "fast" not in name and "a user's" not in name])
