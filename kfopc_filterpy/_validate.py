@@ -7,9 +7,11 @@ import operator
 from collections.abc import Callable, Iterable
 from fractions import Fraction
 from importlib import import_module
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+Choice = TypeVar("Choice")
 
 _LARGEST_OF_RATIO = 50_000  # of the whole numbers of a ratio of sampling rates
 _LOWEST_RATE, _HIGHEST_RATE = 1e-3, 1e9  # Hz; others are not sampling rates of signals
@@ -173,7 +175,7 @@ def as_count(value: Any, name: str, *, minimum: int = 1) -> int:
     return count
 
 
-def as_choice(value: Any, name: str, choices: Iterable[str]) -> str:
+def as_choice(value: Any, name: str, choices: Iterable[Choice]) -> Choice:
     """Return `value` if it is one of `choices`."""
     known = tuple(choices)
     if value not in known:

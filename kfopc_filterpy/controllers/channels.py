@@ -35,6 +35,11 @@ class Channels:
         self.multichannel = several or self.n_references > 1 if multichannel is None else multichannel
         self.n_microphones, self.n_loudspeakers = 1, 1
         secondary, self._path_fs = self._taps_and_rate(paths)
+        if not secondary.any():
+            raise ValueError(
+                "secondary_path must not be all zeros: nothing that the loudspeaker plays would be heard, so there is "
+                "nothing to adapt to; identify the path, see paths.identify_secondary_path"
+            )
         if self.multichannel:
             self.n_microphones, self.n_loudspeakers, _ = secondary.shape
         return secondary

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.fft import irfft, rfft
 
 from .._types import PathModels
-from .._validate import as_positive
+from .._validate import as_choice, as_positive
 from .base import as_forgetting
 from .block import BlockController
 
@@ -60,7 +60,8 @@ class FrequencyDomainFxLMS(BlockController):
     ------
     ValueError
         A step size that is not positive and finite; sizes below 1; a partition size that is not a multiple of the block
-        size; without the constraint, `n_taps` that is not a multiple of the partition size; a path that is not FIR.
+        size; without the constraint, `n_taps` that is not a multiple of the partition size; a path that is not FIR or all
+        zeros.
 
     Notes
     -----
@@ -105,7 +106,7 @@ class FrequencyDomainFxLMS(BlockController):
     ) -> None:
         self.step_size = as_positive(step_size, "step_size")
         self.forgetting = None if forgetting is None else as_forgetting(forgetting)
-        self.constrained = constrained
+        self.constrained = as_choice(constrained, "constrained", (True, False))
         super().__init__(
             n_taps,
             secondary_path,
@@ -113,7 +114,7 @@ class FrequencyDomainFxLMS(BlockController):
             partition_size=partition_size,
             n_references=n_references,
         )
-        if not constrained and self.n_taps % self.partition_size:
+        if not self.constrained and self.n_taps % self.partition_size:
             raise ValueError(
                 f"n_taps must be a multiple of partition_size = {self.partition_size} without the constraint, "
                 f"got {self.n_taps}"

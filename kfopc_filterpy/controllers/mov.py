@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from .._types import NumberOrArray, PathModels, PerLoudspeaker
-from .._validate import as_nonnegative, as_positive
+from .._validate import as_choice, as_nonnegative, as_positive
 from ..power.amplifiers import Amplifiers
 from ..power.constraint import Constraints
 from ..power.limiter import Limiters
@@ -137,7 +137,8 @@ class MOVFxLMS(CoreController):
         penalty_factor: PerLoudspeaker | None = None,
         modified: bool = False,
     ) -> None:
-        settings: dict[str, Any] = {"step_size": step_size, "modified": float(bool(modified))}
+        modified = as_choice(modified, "modified", (True, False))
+        settings: dict[str, Any] = {"step_size": step_size, "modified": float(modified)}
         if penalty_factor is not None:
             self.algorithm = "mov_fixed"
             settings["penalty_factor"] = penalty_factor

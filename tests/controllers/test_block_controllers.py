@@ -183,6 +183,14 @@ def test_the_kalman_filter_learns_from_what_a_limiter_lets_through() -> None:
     assert noise_reduction_db((d - learned)[-y.size :], d[-y.size :]) > 15
 
 
+def test_the_kalman_filter_waits_for_a_disturbance_that_is_longer_under_way_than_its_blocks() -> None:
+    """Without it, errors that are exactly zero would make it certain of its weights."""
+    x, path = np.random.default_rng(0).standard_normal(16000), np.r_[np.zeros(90), 0.5, 0.3, -0.2]
+    controller = FrequencyDomainKalman(128, SECONDARY, block_size=16)
+    run = simulate(controller, x, primary_path=path, secondary_path=SECONDARY)
+    assert noise_reduction_db(run.error, run.disturbance) > 30
+
+
 BANDS: dict[str, Any] = {"band_edges": [0, 4000, 8000], "band_powers": [1.0, 1.0]}
 
 
@@ -191,6 +199,8 @@ BANDS: dict[str, Any] = {"band_edges": [0, 4000, 8000], "band_powers": [1.0, 1.0
     [
         (FrequencyDomainFxLMS, {"partition_size": 12}, "multiple of block_size = 8"),
         (FrequencyDomainFxLMS, {"n_taps": 20, "constrained": False}, "n_taps must be a multiple of partition_size = 8"),
+        (FrequencyDomainFxLMS, {"constrained": "no"}, "constrained must be one of True, False, got 'no'"),
+        (FrequencyDomainFxLMS, {"secondary_path": np.zeros(4)}, "secondary_path must not be all zeros"),
         (FrequencyDomainFxLMS, {"step_size": 0.0}, "step_size"),
         (FrequencyDomainFxLMS, {"forgetting": 1.5}, "forgetting must be 1 at most"),
         (BandLimitedFxLMS, BANDS | {"band_edges": [0, 4000, 3000]}, "band_edges must rise"),

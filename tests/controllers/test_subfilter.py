@@ -87,6 +87,7 @@ def test_an_ample_rated_power_changes_nothing() -> None:
         ({"subfilters": [[1.0, np.nan]]}, "subfilters must be finite"),
         ({"rated_power": 0.0}, "rated_power must be"),
         ({"state_noise": -1.0}, "state_noise must not be negative"),
+        ({"measurement_noise": 0.0}, "measurement_noise must be greater than 0"),
         ({"memory_s": 0.0}, "memory_s must be"),
     ],
 )
