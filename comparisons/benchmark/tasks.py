@@ -9,15 +9,17 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, bandpass_path, power_constrained_wiener
+from kfopc_filterpy._validate import as_choice
 from kfopc_filterpy.bench import Scene, make_scene
 from kfopc_filterpy.bench.scene import reachable_weights
 from kfopc_filterpy.controllers import Controller, CoreController
@@ -144,9 +146,22 @@ def _room(fs: float, *, loudspeakers: int) -> Pair:
     return room.primary, room.secondary
 
 
+def _band(duration_s: float, *, fs: float, band_hz: list[float], rng: int) -> np.ndarray:
+    low, high = band_hz
+    return band_limited_noise((low, high), duration_s, fs=fs, rng=rng)
+
+
+def _compressor(duration_s: float, *, fs: float, rng: int) -> np.ndarray:
+    return compressor_noise(duration_s, fs=fs, rng=rng)
+
+
+def _change(*, at_s: float = 0.0, primary_factor: float = 1.0, secondary_factor: float = 1.0) -> dict[str, float]:
+    return {"at_s": at_s, "primary_factor": primary_factor, "secondary_factor": secondary_factor}
+
+
 NOISES: dict[str, Callable[..., np.ndarray]] = {
-    "band": lambda duration_s, *, band_hz, **o: band_limited_noise(tuple(band_hz), duration_s, **o),
-    "compressor": compressor_noise,
+    "band": _band,
+    "compressor": _compressor,
     "tones": _tones,
     "recorded motor": _recording,
 }
@@ -163,37 +178,73 @@ PATHS: dict[str, Callable[..., Pair]] = {
 
 def read_task(path: Path) -> Task:
     """Return the task of a file; raise `LeftOut` if this machine lacks its data or a package."""
-    said = tomllib.loads(path.read_text(encoding="utf-8"))
-    fs, block = float(said["fs"]), int(said["block"])
-    primary, secondary = PATHS[said["paths"].pop("model")](fs, **said["paths"])
-    make = NOISES[said["noise"].pop("model")]
-    noises = {seed: make(float(said["duration_s"]), fs=fs, rng=seed, **said["noise"]) for seed in SEEDS}
-    _require_same_signals(path, said["signals_sha256"], [primary, secondary, *noises.values()])
+    return _made(_task, tomllib.loads(path.read_text(encoding="utf-8")), path.name, path=path)
+
+
+def _made(make: Callable[..., Any], table: Mapping[str, Any], where: str, **own: Any) -> Any:
+    """Return what a function makes of a table and of `own` values; refuse unknown and missing keys."""
+    keys = {name: one.default is one.empty for name, one in signature(make).parameters.items() if name not in own}
+    unknown = ", ".join(sorted(table.keys() - keys))
+    missing = ", ".join(name for name, needed in keys.items() if needed and name not in table)
+    if unknown or missing:
+        known = ", ".join(name if needed else f"{name} (optional)" for name, needed in keys.items())
+        raise ValueError(
+            f"{where} {f'has the unknown key {unknown}' if unknown else f'lacks {missing}'}; its keys are {known or 'none'}"
+        )
+    return make(**table, **own)
+
+
+def _of_model(models: Mapping[str, Callable[..., Any]], table: Mapping[str, Any], where: str, **own: Any) -> Any:
+    """Return what the model makes that a table names."""
+    settings = dict(table)
+    model = as_choice(settings.pop("model", None), f"{where}: model", models)
+    return _made(models[model], settings, f"{where}, model {model}", **own)
+
+
+def _task(
+    path: Path,
+    title: str,
+    fs: float,
+    duration_s: float,
+    n_taps: int,
+    block: int,
+    rated_power: float,
+    needed_power: float,
+    signals_sha256: str,
+    paths: Mapping[str, Any],
+    noise: Mapping[str, Any],
+    change: Mapping[str, Any] | None = None,
+    path_error: float | None = None,
+) -> Task:
+    primary, secondary = _of_model(PATHS, paths, f"{path.name}, [paths]", fs=fs)
+    own = {"duration_s": duration_s, "fs": fs}
+    noises = {seed: _of_model(NOISES, noise, f"{path.name}, [noise]", rng=seed, **own) for seed in SEEDS}
+    changed = _made(_change, change or {}, f"{path.name}, [change]")
+    _require_same_signals(path, signals_sha256, [primary, secondary, *noises.values()])
     delayed = np.pad(secondary, [(0, 0)] * (secondary.ndim - 1) + [(block, 0)])
     scene = make_scene(
         {seed: noise if secondary.ndim == 1 else np.atleast_2d(noise) for seed, noise in noises.items()},
         primary,
         delayed,
         fs=fs,
-        rated_power=said["rated_power"],
-        power_multiple=said["needed_power"],
-        n_taps=said["n_taps"],
+        rated_power=rated_power,
+        power_multiple=needed_power,
+        n_taps=n_taps,
         switch_on_s=0.0,
         sensor_noise_db=SENSOR_NOISE_DB,
         nse_window_s=NSE_WINDOW_S,
     )
-    change = {"at_s": 0.0, "primary_factor": 1.0, "secondary_factor": 1.0} | said.get("change", {})
     for d in scene.disturbances:
-        d[..., round(change["at_s"] * fs) :] *= change["primary_factor"]
+        d[..., round(changed["at_s"] * fs) :] *= changed["primary_factor"]
     return Task(
-        **vars(scene) | {"secondary_path_uncertainty": said.get("path_error")},
+        **vars(scene) | {"secondary_path_uncertainty": path_error},
         name=path.stem,
-        title=said["title"],
+        title=title,
         digest=digest_of(path),
         block=block,
         primary=primary,
-        changed_at_s=change["at_s"],
-        secondary_factor=change["secondary_factor"],
+        changed_at_s=changed["at_s"],
+        secondary_factor=changed["secondary_factor"],
     )
 
 

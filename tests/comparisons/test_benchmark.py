@@ -67,6 +67,28 @@ def test_a_task_says_that_its_signals_are_no_longer_those_of_its_hash(tmp_path: 
         read_task(other)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("at_s =", "at =", r"\[change\] has the unknown key at; its keys are at_s \(optional\), primary_factor"),
+        ("n_taps =", "taps =", "changed.toml has the unknown key taps; its keys are title, fs, duration_s, n_taps"),
+        ("n_taps = 64", "", "changed.toml lacks n_taps"),
+        (
+            "primary_taps =",
+            "taps =",
+            r"\[paths\], model band-pass has the unknown key taps; its keys are band_hz, primary",
+        ),
+        ('model = "band"', 'model = "hiss"', r"\[noise\]: model must be one of 'band', 'compressor'"),
+    ],
+)
+def test_a_misspelt_key_is_refused(tmp_path: Path, old: str, new: str, says: str) -> None:
+    text = (FOLDER / "bandpass-change.toml").read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    (tmp_path / "changed.toml").write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(ValueError, match=says):
+        read_task(tmp_path / "changed.toml")
+
+
 def test_a_change_of_the_primary_path_is_heard_at_its_time() -> None:
     steady, changed = (read_task(FOLDER / f"bandpass{name}.toml") for name in ("", "-change"))
     ratio = changed.disturbances[1] / np.sqrt(2.0) / (steady.disturbances[1] / 2.0)  # the powers differ by 2 to 4

@@ -67,7 +67,11 @@ def test_a_run_by_blocks_is_the_steps_bit_for_bit(name: str) -> None:
     x, d = rng.standard_normal((2, I, 200)), rng.standard_normal((2, K, 200))
     if not several:
         x, d = x[:, 0], d[:, 0]
-    options: dict[str, Any] = {"secondary_path": [(0.0, path), (40 / FS, 0.9 * path)], "fs": FS, "sensor_noise_std": 0.1}
+    options: dict[str, Any] = {
+        "secondary_path": [(0.0, path), (40 / FS, 0.9 * path)],
+        "fs": FS,
+        "sensor_noise_std": 0.1,
+    }
     options |= {"amplifier": AMPLIFIERS["soft"][0], "record_weights_every": 5, "switch_on_s": 3 / FS, "rng": 1}
 
     def both(rated_power: float) -> Any:
