@@ -26,6 +26,7 @@ from kfopc_filterpy.bench import (
     write_whole,
 )
 from kfopc_filterpy.bench.registry import registered
+from kfopc_filterpy.bench.scene import one_blas_thread
 from kfopc_filterpy.bench.tuning import BUDGET
 
 from .blocks import CommandController, EntryFailed
@@ -208,7 +209,7 @@ def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = Non
         parser.error(str(error))
     entries: dict[str, Entry] = {**own_entries(), **peers(), **(objects or {}), **commands}
     runs, outcomes = Runs(), []
-    with warnings.catch_warnings():
+    with one_blas_thread(), warnings.catch_warnings():  # the runs that are timed take one, too
         warnings.simplefilter("ignore", RuntimeWarning)  # of filters that diverge while they are tuned
         for path in files:
             try:
