@@ -14,6 +14,7 @@ from .._types import ChangingPaths, PerLoudspeaker, Seed
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
 from ..controllers.base import Controller, Looped, checked_controller, differing_counts, listening
 from ..controllers.block import runs_in_blocks
+from ..controllers.channels import Channels
 from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..controllers.processing import takes_none
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
@@ -367,7 +368,7 @@ def is_multichannel(
     controller: object, reference: Any, secondary_path: ChangingPaths, disturbance: ArrayLike | None
 ) -> bool:
     """Return whether a run has several channels: its controller, one of its signals or its secondary paths say so."""
-    own = isinstance(controller, CoreController) and controller.multichannel
+    own = isinstance(controller, Channels) and controller.multichannel
     heard: Any = disturbance
     return (
         own
@@ -459,10 +460,10 @@ def _amplifiers(amplifier: Any, J: int) -> tuple[list[Any], np.ndarray]:
 
 
 def _require_fit(controller: Any, n_references: int, n_loudspeakers: int, n_microphones: int, several: bool) -> None:
-    """Raise ValueError if a built-in controller is made for other numbers of channels."""
-    if not several or not isinstance(controller, CoreController):
+    """Raise ValueError if a controller says that it is made for other numbers of channels."""
+    if not several:
         return
-    if not controller.multichannel:
+    if isinstance(controller, Channels) and not controller.multichannel:
         raise ValueError("controller has one channel: give it secondary paths (K microphones, J loudspeakers, taps)")
     run = {"n_references": n_references, "n_loudspeakers": n_loudspeakers, "n_microphones": n_microphones}
     for name, own in differing_counts(controller, **run):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.channels import random_paths, through
 
-from kfopc_filterpy import FxLMS, kf_pb, simulate
+from kfopc_filterpy import FrequencyDomainFxLMS, FxLMS, kf_pb, simulate
 from kfopc_filterpy.paths import fir_path
 
 K, J, REFERENCES, N = 3, 2, 2, 400
@@ -29,6 +29,10 @@ class Fixed:
 
     def update(self, error: np.ndarray) -> None:
         self.errors.append(error)
+
+
+class StatesItsChannels(Fixed):
+    n_microphones = 5
 
 
 def run(controller: Any = None, **changed: Any) -> Any:
@@ -104,8 +108,11 @@ def test_a_divergence_ends_the_run_with_nan() -> None:
         ({"rated_power": [1.0, 2.0, 3.0]}, "each of the 2 loudspeakers"),
         ({"controller": kf_pb(8, SECONDARY, rated_power=1.0)}, "made for 1 references"),
         ({"controller": FxLMS(8, [1.0], step_size=0.1)}, "one channel"),
+        ({"controller": FrequencyDomainFxLMS(8, [1.0], step_size=0.1, block_size=4)}, "one channel"),
+        ({"controller": FrequencyDomainFxLMS(8, SECONDARY, step_size=0.1, block_size=4)}, "made for 1 references"),
+        ({"controller": StatesItsChannels()}, "made for 5 microphones"),
     ],
-    ids=range(15),
+    ids=range(18),
 )
 def test_shapes_that_do_not_fit_are_refused_by_the_name_of_the_axis(changed: dict, match: str) -> None:
     with pytest.raises(ValueError, match=match):
