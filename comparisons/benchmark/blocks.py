@@ -39,7 +39,7 @@ class PlaysBlocks(ABC):
 
     @abstractmethod
     def exchange(self, references: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        """Return the control signals y, (J, block), for the references (I, block), and adapt to the errors (K, block)."""
+        """Return the control signals (J, block) for the references (I, block), and adapt to the errors (K, block)."""
 
     def control_signal(self, reference: Any) -> Any:
         """Return the current sample of the block that is being played, and store the reference."""

@@ -1,7 +1,7 @@
 """The entries: the algorithms of this package, and adaptive filters of other packages, used as installed.
 
-Filters of other packages are made for system identification or for filtered-x LMS. Each is put into the structure that its
-interface requires, has its own grid of settings, and is tuned by the rule for all.
+Filters of other packages are made for system identification or for filtered-x LMS. Each is put into the structure that
+its interface requires, has its own grid of settings, and is tuned by the rule for all.
 """
 
 from __future__ import annotations

@@ -56,8 +56,8 @@ class Score:
     loudest_second_db : float
         Power of the error relative to that of the disturbance in dB, in the second in which this is largest.
     time_s : float
-        Time from the last change of the plant until 90 % of the steady noise reduction in dB is reached; NaN if the noise
-        is not reduced.
+        Time from the last change of the plant until 90 % of the steady noise reduction in dB is reached; NaN if the
+        noise is not reduced.
     cost : float
         Processor time of a run, divided by that of FxLMS; for a command, the elapsed time divided by the same.
     setting : float or tuple of float, optional

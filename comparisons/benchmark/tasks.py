@@ -188,9 +188,8 @@ def _made(make: Callable[..., Any], table: Mapping[str, Any], where: str, **own:
     missing = ", ".join(name for name, needed in keys.items() if needed and name not in table)
     if unknown or missing:
         known = ", ".join(name if needed else f"{name} (optional)" for name, needed in keys.items())
-        raise ValueError(
-            f"{where} {f'has the unknown key {unknown}' if unknown else f'lacks {missing}'}; its keys are {known or 'none'}"
-        )
+        wrong = f"has the unknown key {unknown}" if unknown else f"lacks {missing}"
+        raise ValueError(f"{where} {wrong}; its keys are {known or 'none'}")
     return make(**table, **own)
 
 
@@ -260,6 +259,6 @@ def _require_same_signals(path: Path, expected: str, signals: list[np.ndarray]) 
         digest.update(np.round(signal / np.sqrt(np.mean(signal**2)), DECIMALS).astype("<f4").tobytes())
     if digest.hexdigest() != expected:
         raise ValueError(
-            f"{path.name} was made for other signals: their hash is {digest.hexdigest()}, not {expected}. If a model was "
-            "changed on purpose, write this hash into the file; scores from before cannot be compared then"
+            f"{path.name} was made for other signals: their hash is {digest.hexdigest()}, not {expected}. If a model "
+            "was changed on purpose, write this hash into the file; scores from before cannot be compared then"
         )

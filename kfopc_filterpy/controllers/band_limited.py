@@ -22,8 +22,8 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
     r"""Frequency-domain FxLMS within a power limit for each frequency band of the control signal.
 
     A band whose limit is exceeded gets a price :math:`\lambda_b`, the weight of a penalty on its power (a Lagrange
-    multiplier). The other bands adapt as without limits. With the spectrum Y of the block's control signal, the powers :math:`p_b` in the bands, their limits
-    :math:`\rho_b` and the gain :math:`G_b = E|X'|^2 / E|X|^2` in a band,
+    multiplier). The other bands adapt as without limits. With the spectrum Y of the block's control signal, the powers
+    :math:`p_b` in the bands, their limits :math:`\rho_b` and the gain :math:`G_b = E|X'|^2 / E|X|^2` in a band,
 
     .. math::
 
@@ -33,8 +33,8 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
 
     .. math:: \lambda_b \leftarrow \max\Big\{\lambda_b + \frac{\mu}{16}\, G_b \Big(\frac{p_b}{\rho_b} - 1\Big),\ 0\Big\}
 
-    It settles where :math:`E[e^2] + \sum_b \lambda_b (p_b - \rho_b)` is stationary, so each band keeps its limit with the
-    least error. With one band, from 0 to fs/2, this is the power-constrained Wiener solution.
+    It settles where :math:`E[e^2] + \sum_b \lambda_b (p_b - \rho_b)` is stationary, so each band keeps its limit with
+    the least error. With one band, from 0 to fs/2, this is the power-constrained Wiener solution.
 
     Parameters
     ----------
@@ -44,8 +44,8 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
         Edges of adjacent bands in Hz, rising, within 0 to fs/2. A band must be at least as wide as the spacing of the
         bins, ``fs / (N + B)``. Bins outside all bands have no limit.
     band_powers : array_like, shape (n_bands,) or (J, n_bands)
-        Power limit (mean square) of the control signal in each band, above zero; (J, n_bands) gives each loudspeaker its
-        own.
+        Power limit (mean square) of the control signal in each band, above zero; (J, n_bands) gives each loudspeaker
+        its own.
     fs : float, default 16000
         Sample rate in Hz.
     forgetting : float, default 0.9
@@ -73,12 +73,13 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
     filter", EURASIP Journal on Advances in Signal Processing 2013:17; B. Rafaely, S. J. Elliott, "A computationally
     efficient frequency-domain LMS algorithm with constraints on the adaptive filter", IEEE Trans. Signal Processing
     48(6), 2000. Only the abstract and the introduction of the first were available; it has penalty functions on the
-    power in each bin of a frequency-domain LMS. With a penalty of fixed weight, the power exceeds its limit by an amount that
-    depends on the weight; here the weight of each band is integrated until the limit is met.
+    power in each bin of a frequency-domain LMS. With a penalty of fixed weight, the power exceeds its limit by an
+    amount that depends on the weight; here the weight of each band is integrated until the limit is met.
 
     Examples
     --------
-    White noise whose cancellation takes a power of 0.5 in each half of the spectrum; the upper half may have half of that:
+    White noise whose cancellation takes a power of 0.5 in each half of the spectrum; the upper half may have half of
+    that:
 
     >>> import numpy as np
     >>> from kfopc_filterpy import BandLimitedFxLMS, simulate
@@ -120,13 +121,12 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
             n_references=n_references,
         )
         self.fs = as_rate(fs, "fs")
-        samples = self.partition_size + self.block_size
-        self._bands = _bins_of_bands(band_edges, self.fs, samples)
+        self._bands = _bins_of_bands(band_edges, self.fs, self._size)
         self._limits = self._checked_limits(band_powers)
         self._prices = np.zeros((self.n_loudspeakers, len(self._bands)))
         self._output_powers = np.zeros_like(self._prices)
         self._reference_powers = np.zeros_like(self._powers)
-        self._window_shape = np.hanning(samples + 1)[:-1]
+        self._window_shape = np.hanning(self._size + 1)[:-1]
 
     def _checked_limits(self, powers: Any) -> np.ndarray:
         limits, shape = as_real_array(powers, "band_powers"), (self.n_loudspeakers, len(self._bands))
@@ -201,8 +201,8 @@ def _bins_of_bands(edges: Any, fs: float, samples: int) -> np.ndarray:
         raise ValueError(f"band_edges must rise from 0 or above to fs/2 = {fs / 2:g} Hz at most, got {edges!r}")
     if np.diff(values).min() < spacing:
         raise ValueError(
-            f"band_edges must be {spacing:.4g} Hz apart at least, as the bins are, got {np.diff(values).min():g}: take wider "
-            "bands or a longer partition"
+            f"band_edges must be {spacing:.4g} Hz apart at least, as the bins are, got {np.diff(values).min():g}: take "
+            "wider bands or a longer partition"
         )
     bins = np.arange(samples // 2 + 1)
     # A bin reaches half a spacing to both sides; those at 0 and fs/2 have one side.

@@ -1,4 +1,4 @@
-"""The base class of the controllers that adapt once per block of samples, in numpy: signals, spectra, delayless output."""
+"""The base class of the controllers that adapt once per block, in numpy: signals, spectra, delayless output."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ TINY = float(np.finfo(float).tiny)
 class BlockController(Channels, BlockProcessing, Checkpointed):
     r"""Base class of the block controllers: they keep the control filter for B samples, then `_adapt` changes it.
 
-    The control filter is kept as spectra of P partitions with N taps each. A block of B samples is filtered by overlap-save
-    with transforms of N + B samples. The control signal has no delay: what the samples before the block contribute to it
-    is computed when the block begins, and what the block's own samples contribute takes B multiplications per sample,
+    The control filter is kept as spectra of P partitions with N taps each. A block of B samples is filtered by
+    overlap-save with transforms of N + B samples. The control signal has no delay: what the samples before the block
+    contribute to it is computed when the block begins, and what the block's own samples contribute takes B
+    multiplications per sample,
 
     .. math:: y(n_0 + i) = \sum_{l=0}^{i} w_l\, x(n_0 + i - l) + \sum_{l>i} w_l\, x(n_0 + i - l)
 
@@ -60,12 +61,13 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         N = self.partition_size = B if partition_size is None else as_count(partition_size, "partition_size")
         if N % B:
             raise ValueError(
-                f"partition_size must be a multiple of block_size = {B}, got {N}: the spectra of earlier blocks are used again"
+                f"partition_size must be a multiple of block_size = {B}, got {N}: spectra of earlier blocks are used again"
             )
         K, J, I = self.n_microphones, self.n_loudspeakers, self.n_references  # noqa: E741
         P = self.n_partitions = -(-self.n_taps // N)
         self._every = N // B  # blocks between the spectra of neighbouring partitions
-        spectra, bins = (P - 1) * self._every + 1, (N + B) // 2 + 1
+        self._size = N + B  # of the transforms
+        spectra, bins = (P - 1) * self._every + 1, self._size // 2 + 1
         self._take_path(path)
         # Signals run forward in time, up to the end of the last block.
         self._references = np.zeros((I, (P - 1) * N + self._window))
@@ -73,7 +75,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         self._now = np.zeros((I, 2 * B - 1))  # the references of this block, after zeros
         self._played, self._errors = np.zeros((J, B)), np.zeros((K, B))  # control signals and errors of this block
         self._n, self._taken = 0, np.zeros(B, dtype=bool)  # samples of this block; whose errors were taken
-        # Spectra of N + B samples, the newest block first.
+        # Spectra, the newest block first.
         self._X = np.zeros((I, spectra, bins), dtype=complex)
         self._X_filtered = np.zeros((K, J, I, spectra, bins), dtype=complex)
         self._W = np.zeros((J, I, P, bins), dtype=complex)
@@ -84,8 +86,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
 
     def _take_path(self, path: np.ndarray) -> None:
         self._path = path
-        size = self.partition_size + self.block_size + path.shape[-1] - 1
-        self._window = next_fast_len(size, real=True)
+        self._window = next_fast_len(self._size + path.shape[-1] - 1, real=True)
         paths = path.reshape(self.n_microphones, self.n_loudspeakers, 1, -1)
         self._S = rfft(paths, self._window)
 
@@ -94,7 +95,8 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         """Estimated secondary path s^, (n_path,), or with several channels (K, J, n_path); a copy.
 
         A new estimate can be assigned between two samples: taps or an FIR system, with several channels as many paths
-        as before, and no longer than the present estimate. The stored references are filtered again with it; the weights stay.
+        as before, and no longer than the present estimate. The stored references are filtered again with it; the
+        weights stay.
         """
         return self._path.copy()
 
@@ -111,12 +113,12 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         return rfft(self._newest(irfft(x * self._S, self._window)))
 
     def _least_power(self) -> float:
-        """Return a power far below that of the filtered references: a path that is still silent leaves rounding errors."""
+        """Return a power far below that of the filtered references: a path that is silent as yet leaves rounding errors."""
         return ROUNDING * float(np.sum(self._path**2) * np.mean(self._newest(self._references) ** 2)) + TINY
 
     def _newest(self, signal: np.ndarray) -> np.ndarray:
         """Return the newest N + B samples."""
-        return signal[..., -(self.partition_size + self.block_size) :]
+        return signal[..., -self._size :]
 
     # The control filter.
 
@@ -128,11 +130,11 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
 
     def _partitions(self, spectra: np.ndarray) -> np.ndarray:
         """Return the taps of partitions, (..., N); the taps beyond N of their transforms are left out."""
-        return irfft(spectra, self.partition_size + self.block_size)[..., : self.partition_size]
+        return irfft(spectra, self._size)[..., : self.partition_size]
 
     def _spectra(self, partitions: np.ndarray) -> np.ndarray:
         """Return the spectra of partitions (..., N)."""
-        return rfft(partitions, self.partition_size + self.block_size)
+        return rfft(partitions, self._size)
 
     def _block_spectrum(self, block: np.ndarray) -> np.ndarray:
         """Return the spectra of blocks (..., B) with zeros in place of the samples before them."""
@@ -140,7 +142,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
 
     def _block_of(self, spectra: np.ndarray) -> np.ndarray:
         """Return what overlap-save keeps of filtered spectra, the last B samples, (..., B)."""
-        return irfft(spectra, self.partition_size + self.block_size)[..., self.partition_size :]
+        return irfft(spectra, self._size)[..., self.partition_size :]
 
     def _adapt(self) -> None:
         """Replace the control filter's spectra after a block in which at least one error was taken."""

@@ -67,6 +67,10 @@ class ChannelFilters:
     def push(self, sample: np.ndarray) -> None:
         """Add the newest sample of the inputs."""
         self._line[sample.size :] = self._line[: self._line.size - sample.size]
+        self.replace(sample)
+
+    def replace(self, sample: np.ndarray) -> None:
+        """Put another sample in the place of the newest one."""
         self._line[: sample.size] = sample[: self._line.size]
 
     def output(self) -> np.ndarray:

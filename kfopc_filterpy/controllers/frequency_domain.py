@@ -16,8 +16,8 @@ RIDGE = 0.01  # of the mean power of all bins, added to that of each: the noise 
 class FrequencyDomainFxLMS(BlockController):
     r"""FxLMS that adapts once per block of B samples, by Fourier transforms: cheap with many taps.
 
-    With :math:`X'_p` the spectrum of the filtered reference that partition p of the control filter sees, and E that of the
-    block's errors after zeros,
+    With :math:`X'_p` the spectrum of the filtered reference that partition p of the control filter sees, and E that of
+    the block's errors after zeros,
 
     .. math::
 
@@ -27,10 +27,11 @@ class FrequencyDomainFxLMS(BlockController):
 
        \Lambda = \sum_p |X'_p|^2
 
-    C is the gradient constraint: in the time domain, the taps beyond the partition are set to zero. M is causal, the minimum-phase
-    factor of the step. With it, all bins converge at about the same rate, whatever the colour of the noise, and the
-    weights settle at the best causal filter; a step :math:`1/\Lambda` applied at once would also weight what no
-    causal filter can cancel. Without M this is exactly the block LMS, :math:`w \leftarrow w + \mu \sum_n e(n)\, x'(n)`.
+    C is the gradient constraint: in the time domain, the taps beyond the partition are set to zero. M is causal, the
+    minimum-phase factor of the step. With it, all bins converge at about the same rate, whatever the colour of the
+    noise, and the weights settle at the best causal filter; a step :math:`1/\Lambda` applied at once would also weight
+    what no causal filter can cancel. Without M this is exactly the block LMS, :math:`w \leftarrow w + \mu \sum_n e(n)\,
+    x'(n)`.
 
     Parameters
     ----------
@@ -41,13 +42,13 @@ class FrequencyDomainFxLMS(BlockController):
     block_size : int
         Samples B of a block. The weights follow a change no sooner than at the end of a block.
     partition_size : int, optional
-        Taps N of a partition, a multiple of B; by default B. With at least `n_taps`, there is one partition. The result of the
-        block LMS does not depend on it.
+        Taps N of a partition, a multiple of B; by default B. With at least `n_taps`, there is one partition. The result
+        of the block LMS does not depend on it.
     constrained : bool, default True
         False leaves out C except in the first partition, where the delayless control signal needs it. This saves most
         of the transforms. But each partition then also has taps that repeat those of its neighbours (`weights` leaves
-        them out) and vary within a block, so the secondary path must be much shorter than a block, and the weights settle
-        only near the best filter.
+        them out) and vary within a block, so the secondary path must be much shorter than a block, and the weights
+        settle only near the best filter.
     forgetting : float or None, default 0.9
         Forgetting factor, per block, of the powers :math:`\Lambda`. None gives the block LMS, without M.
 
@@ -60,22 +61,22 @@ class FrequencyDomainFxLMS(BlockController):
     ------
     ValueError
         A step size that is not positive and finite; sizes below 1; a partition size that is not a multiple of the block
-        size; without the constraint, `n_taps` that is not a multiple of the partition size; a path that is not FIR or all
-        zeros.
+        size; without the constraint, `n_taps` that is not a multiple of the partition size; a path that is not FIR or
+        all zeros.
 
     Notes
     -----
-    The control signal has no delay: what earlier samples contribute to it is computed when a block begins, and the block's
-    own samples take B multiplications each. A block takes some ``4 P`` transforms of ``N + B`` samples with the constraint,
-    and a fixed number without. If the secondary path is longer than a block, the step size must be smaller. For a limiter,
-    wrap it in a `LimitedController`. References above 1e20 and errors above 1e100 are refused.
+    The control signal has no delay: what earlier samples contribute to it is computed when a block begins, and the
+    block's own samples take B multiplications each. A block takes some ``4 P`` transforms of ``N + B`` samples with the
+    constraint, and a fixed number without. If the secondary path is longer than a block, the step size must be smaller.
+    For a limiter, wrap it in a `LimitedController`. References above 1e20 and errors above 1e100 are refused.
 
     References
     ----------
-    J. J. Shynk, "Frequency-domain and multirate adaptive filtering", IEEE Signal Processing Magazine 9(1), 1992. F. Yang,
-    Y. Cao, M. Wu, F. Albu, J. Yang, "Frequency-domain filtered-x LMS algorithms for active noise control: a review and new
-    insights", Applied Sciences 8(11), 2018. The spectral factors of the step: S. J. Elliott, B. Rafaely, "Frequency-domain
-    adaptation of causal digital filters", IEEE Trans. Signal Processing 48(5), 2000.
+    J. J. Shynk, "Frequency-domain and multirate adaptive filtering", IEEE Signal Processing Magazine 9(1), 1992. F.
+    Yang, Y. Cao, M. Wu, F. Albu, J. Yang, "Frequency-domain filtered-x LMS algorithms for active noise control: a
+    review and new insights", Applied Sciences 8(11), 2018. The spectral factors of the step: S. J. Elliott, B. Rafaely,
+    "Frequency-domain adaptation of causal digital filters", IEEE Trans. Signal Processing 48(5), 2000.
 
     Examples
     --------
@@ -135,7 +136,7 @@ class FrequencyDomainFxLMS(BlockController):
 
     def _divisor(self, powers: np.ndarray) -> np.ndarray:
         """Return Lambda by the powers that a partition sees in each bin, (..., bins)."""
-        least = (self.partition_size + self.block_size) * self._least_power()
+        least = self._size * self._least_power()
         return self.n_partitions * (powers + RIDGE * np.mean(powers, axis=-1, keepdims=True) + least)
 
     def _gradient(self) -> np.ndarray:
@@ -146,7 +147,7 @@ class FrequencyDomainFxLMS(BlockController):
     def _descend(self, gradient: np.ndarray, divisor: np.ndarray) -> None:
         """Take a step along a gradient (J, I, P, bins), divided in each bin."""
         if self.forgetting is not None:
-            factor = minimum_phase(divisor**-0.5)
+            factor = minimum_phase(divisor**-0.5, self._size)
             gradient *= factor.conj()
             self._constrain(gradient)
             gradient *= factor
@@ -162,10 +163,12 @@ class FrequencyDomainFxLMS(BlockController):
         chosen[:] = self._spectra(taps)
 
 
-def minimum_phase(magnitude: np.ndarray) -> np.ndarray:
-    """Return the spectrum (..., bins) of the causal filter with this magnitude and the least delay, by its cepstrum."""
-    cepstrum = irfft(np.log(magnitude))
-    half = cepstrum.shape[-1] // 2
-    cepstrum[..., 1:half] *= 2.0
-    cepstrum[..., half + 1 :] = 0.0
+def minimum_phase(magnitude: np.ndarray, size: int) -> np.ndarray:
+    """Return the spectrum (..., bins) of the causal filter with this magnitude and the least delay, by its cepstrum.
+
+    `size` is that of the transform.
+    """
+    cepstrum = irfft(np.log(magnitude), size)
+    cepstrum[..., 1 : (size + 1) // 2] *= 2.0
+    cepstrum[..., size // 2 + 1 :] = 0.0
     return np.exp(rfft(cepstrum))

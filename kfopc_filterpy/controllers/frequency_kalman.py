@@ -15,9 +15,10 @@ from .frequency_domain import FrequencyDomainFxLMS
 class FrequencyDomainKalman(FrequencyDomainFxLMS):
     r"""Partitioned-block frequency-domain Kalman filter: frequency-domain FxLMS with the Kalman gain as its step.
 
-    The spectra :math:`W_p` of the control filter's partitions are the state. Their errors are assumed to be independent,
-    with a variance :math:`P_p` in each bin, and to grow from block to block. With :math:`X'_p` the spectra of the filtered
-    reference, E that of :math:`\hat d - w^T x'` in the block, its mean power :math:`\Psi`, and :math:`b = B/(N+B)`,
+    The spectra :math:`W_p` of the control filter's partitions are the state. Their errors are assumed to be
+    independent, with a variance :math:`P_p` in each bin, and to grow from block to block. With :math:`X'_p` the spectra
+    of the filtered reference, E that of :math:`\hat d - w^T x'` in the block, its mean power :math:`\Psi`, and :math:`b
+    = B/(N+B)`,
 
     .. math::
 
@@ -58,8 +59,8 @@ class FrequencyDomainKalman(FrequencyDomainFxLMS):
     References
     ----------
     G. Enzner, P. Vary, "Frequency-domain adaptive Kalman filter for acoustic echo control in hands-free telephones",
-    Signal Processing 86(6), 2006. F. Kuech, E. Mabande, G. Enzner, "State-space architecture of the partitioned-block-based
-    acoustic echo controller", ICASSP 2014. Both apply the gain at once; for its factors M, see
+    Signal Processing 86(6), 2006. F. Kuech, E. Mabande, G. Enzner, "State-space architecture of the
+    partitioned-block-based acoustic echo controller", ICASSP 2014. Both apply the gain at once; for its factors M, see
     `FrequencyDomainFxLMS`.
 
     Examples
@@ -111,7 +112,7 @@ class FrequencyDomainKalman(FrequencyDomainFxLMS):
         self._noise = self._averaged(self._noise, np.abs(E[0]) ** 2)
         P *= self.transition**2
         P += (1.0 - self.transition**2) * np.abs(W) ** 2
-        share, powers = self.block_size / (self.block_size + self.partition_size), np.abs(X) ** 2
+        share, powers = self.block_size / self._size, np.abs(X) ** 2
         step = P / (share * np.sum(powers * P, axis=0) + self._noise + TINY)
         self._descend((X.conj() * E)[None, None], 1.0 / step)
         P *= 1.0 - share * step * powers

@@ -18,13 +18,13 @@ PROTOTYPE_BANDS = 4  # taps of the prototype over the number of bands: its stopb
 class SubbandFxLMS(BlockController):
     r"""Delayless subband FxLMS: errors and filtered references are split into bands, in which normalised LMS adapts.
 
-    A filter bank of M bands, each fs/M wide and sampled at 2 fs/M, splits the filtered reference into x'_b and the error
-    into e_b. In each band, a complex filter of 2L/M taps adapts once per subband sample,
+    A filter bank of M bands, each fs/M wide and sampled at 2 fs/M, splits the filtered reference into x'_b and the
+    error into e_b. In each band, a complex filter of 2L/M taps adapts once per subband sample,
 
     .. math:: w_b \leftarrow w_b + \mu\, \frac{e_b\, x_b'^*}{\epsilon + \lVert x'_b \rVert^2}
 
-    At the end of a block, the spectra of these filters are stacked, each bin from the nearest band, and transformed back
-    into the control filter of L taps. This filters the reference itself, so the control signal has no delay.
+    At the end of a block, the spectra of these filters are stacked, each bin from the nearest band, and transformed
+    back into the control filter of L taps. This filters the reference itself, so the control signal has no delay.
 
     Parameters
     ----------
@@ -40,24 +40,24 @@ class SubbandFxLMS(BlockController):
     Raises
     ------
     ValueError
-        A step size that is not positive and finite; sizes below 1; an odd number of bands; `n_taps` or `block_size` that
-        is not the multiple stated above; a path that is not FIR.
+        A step size that is not positive and finite; sizes below 1; an odd number of bands; `n_taps` or `block_size`
+        that is not the multiple stated above; a path that is not FIR.
 
     Notes
     -----
     The prototype of the bank is a low-pass filter of 4 M taps. The errors pass the bank, which delays the adaptation by
-    2 M samples; this limits the step size. The filter of a band lasts as long as the control filter, but a response between
-    two bands, or a delay that is no multiple of M/2, needs taps beyond that. So the weights settle near the best filter, not
-    at it. For L + 4 M samples after a new `secondary_path` is assigned, the stored references of the bands still include the
-    old one. To limit the control signal, wrap the controller in a `LimitedController`.
+    2 M samples; this limits the step size. The filter of a band lasts as long as the control filter, but a response
+    between two bands, or a delay that is no multiple of M/2, needs taps beyond that. So the weights settle near the
+    best filter, not at it. For L + 4 M samples after a new `secondary_path` is assigned, the stored references of the
+    bands still include the old one. To limit the control signal, wrap the controller in a `LimitedController`.
 
     References
     ----------
     D. R. Morgan, J. C. Thi, "A delayless subband adaptive filter architecture", IEEE Trans. Signal Processing 43(8),
-    1995: the structure, and the stacking of the spectra; there the bin at fs/2 is zero; here it is kept, because a short
-    filter needs it. S. J. Park, J. H. Yun, Y. C. Park, D. H. Youn, "A delayless
-    subband active noise control system for wideband noise control", IEEE Trans. Speech and Audio Processing 9(8), 2001,
-    models the secondary path in the bands; here the reference is filtered in the full band, by Fourier transforms.
+    1995: the structure, and the stacking of the spectra; there the bin at fs/2 is zero; here it is kept, because a
+    short filter needs it. S. J. Park, J. H. Yun, Y. C. Park, D. H. Youn, "A delayless subband active noise control
+    system for wideband noise control", IEEE Trans. Speech and Audio Processing 9(8), 2001, models the secondary path in
+    the bands; here the reference is filtered in the full band, by Fourier transforms.
 
     Examples
     --------

@@ -132,8 +132,8 @@ class SubfilterKalman(BlockProcessing, Checkpointed):
     ----------
     The structure is that of Z. Luo, D. Shi, X. Shen, J. Ji, W.-S. Gan, "GFANC-Kalman: Generative fixed-filter active
     noise control with CNN-Kalman filtering", IEEE Signal Process. Lett. 31, 2024. There, a network tells from each
-    second of noise which of 15 sub-filters it needs, and the Kalman filter smooths these answers. Here, the Kalman filter
-    observes the error microphone instead.
+    second of noise which of 15 sub-filters it needs, and the Kalman filter smooths these answers. Here, the Kalman
+    filter observes the error microphone instead.
 
     Examples
     --------
@@ -209,6 +209,10 @@ class SubfilterKalman(BlockProcessing, Checkpointed):
         y = float(self.gains @ self._outputs[: len(self.subfilters)])
         self._played.push(np.array([y]))
         return y
+
+    def emitted(self, control_signal: float) -> None:
+        """Take `control_signal`, to which a limiter changed the last one; `LimitedController` calls this."""
+        self._played.replace(np.array([control_signal]))
 
     def update(self, error: float) -> None:
         """Let the gains adapt to the error e(n) that the last control signal left."""

@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener, simulate
+from kfopc_filterpy import (
+    LimitedController,
+    OutputLimiter,
+    noise_reduction_db,
+    output_power,
+    power_constrained_wiener,
+    simulate,
+)
 from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.controllers import Controller, SubfilterKalman, band_subfilters
 
@@ -69,6 +76,15 @@ def test_the_rated_power_is_kept_and_spent_as_the_bound_spends_it(share: float) 
     assert output_power(result.control_signal) == pytest.approx(rated, rel=0.02)
     best = power_constrained_wiener(x, result.disturbance, SECONDARY, L, rated, fs=FS).whole.noise_reduction_db
     assert best - 0.3 < noise_reduction_db(result.error, result.disturbance) < best + 0.1
+
+
+def test_the_gains_are_learned_from_what_a_limiter_lets_through() -> None:
+    """With the signal before the limiter, the disturbance would look louder than it is."""
+    free, controller = (SubfilterKalman(band_subfilters(broadband()), SECONDARY, fs=FS, **NOISES) for _ in range(2))
+    x = white(4000, 2)
+    rated = 0.1 * output_power(run(free, x).control_signal)
+    run(LimitedController(controller, OutputLimiter(rated, fs=FS)), x)
+    np.testing.assert_allclose(controller.gains, 1.0, atol=0.02)
 
 
 def test_an_ample_rated_power_changes_nothing() -> None:
