@@ -182,7 +182,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         return self.block_size - self._n % self.block_size
 
     def emit(self, x: np.ndarray, limit: np.ndarray | None = None) -> np.ndarray:
-        """Return the control signals (J, n) for references (I, n) of at most `samples_left` samples.
+        """Return the control signals (J, n) for references x (I, n) of at most `samples_left` samples.
 
         They end before the first sample that is not within a `limit` (J, 1), unless this is their first one.
         """
