@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 # /// script
-# dependencies = ["nox>=2024.10.9"]
+# dependencies = ["nox>=2026.8.10"]
 # ///
-"""Tasks: `nox -l` lists them, `nox -s docs` runs one. What follows `--` goes to pytest, Sphinx or cosmic-ray.
+"""Tasks: `nox -l` lists them, `nox -s docs` runs one. What follows `--` goes to pytest, Sphinx, the studies or cosmic-ray.
 
-`.ci/run` is no session: it runs the README's own commands from a fresh clone, and what it can beside one another.
+`.ci/run` runs those marked with a star, `.ci/slow` runs bare, wheels, slow and fuzz; both bring nox.
 """
 
 from __future__ import annotations
@@ -16,18 +16,29 @@ import random
 import re
 import shutil
 import sqlite3
+import zipfile
 from pathlib import Path
 
 import nox
 
-nox.needs_version = ">=2024.10.9"
-nox.options.default_venv_backend = "virtualenv"  # `range` asks the pip of its environment
+nox.needs_version = ">=2026.8.10"
+nox.options.default_venv_backend = "virtualenv"  # its environments have pip, which some sessions run
 nox.options.error_on_missing_interpreters = True
 
 PINNED = ("-c", "constraints.txt")
 PROJECT = nox.project.load_toml("pyproject.toml")
 COMPUTED = ["tests/filters", "tests/loop", "tests/power", "tests/bounds", "tests/paths", "tests/test_metrics.py"]
 COVERED = ["filters", "loop", "power", "core"]
+# The tags of wheels, and the machines in zig's words, with the oldest C library or system.
+SYSTEMS = {
+    "manylinux_2_17_x86_64": "x86_64-linux-gnu.2.17",
+    "manylinux_2_17_aarch64": "aarch64-linux-gnu.2.17",
+    "musllinux_1_1_x86_64": "x86_64-linux-musl",
+    "musllinux_1_1_aarch64": "aarch64-linux-musl",
+    "macosx_11_0_x86_64": "x86_64-macos.11.0",
+    "macosx_11_0_arm64": "aarch64-macos.11.0",
+    "win_amd64": "x86_64-windows-gnu",
+}
 EVERY_NAME_AND_README = """
 import doctest
 import inspect
@@ -48,31 +59,146 @@ raise SystemExit(failed > 0)
 """
 
 
+def run_readme(session: nox.Session, module: str, **env: str) -> None:
+    """Run README's line that installs what a module needs and runs it, word for word, in the `.venv` that it makes."""
+    form = rf"python3 -m venv \.venv && .+ && \.venv/bin/python -m {module}\b.*"
+    lines = [line for line in Path("README.md").read_text(encoding="utf-8").splitlines() if re.fullmatch(form, line)]
+    if len(lines) != 1:
+        session.error(f"README.md must state one line of this form, and has {len(lines)}: {form}")
+    line = lines[0].replace("/bin/", "/Scripts/") if os.name == "nt" else lines[0]
+    session.run("sh", "-c", f'{line} "$@"', "sh", *session.posargs, env=env)
+
+
 def install_group(session: nox.Session, *groups: str) -> None:
     """Install dependency groups, as pinned; the pip that CPython 3.11 and 3.12 bring does not know them."""
     session.install(*PINNED, *nox.project.dependency_groups(PROJECT, *groups))
 
 
+def copy_tree(session: nox.Session) -> Path:
+    """Return a folder with a copy of the files in git's index, which are without libraries."""
+    tree = Path(session.create_tmp()).resolve() / "tree"
+    shutil.rmtree(tree, ignore_errors=True)
+    session.run("git", "checkout-index", "--all", f"--prefix={tree}/", external=True)
+    return tree
+
+
+def build_wheel(session: nox.Session, *options: str, folder: Path, **env: str | None) -> Path:
+    """Build a wheel into a folder, and return it."""
+    session.run("python", "-m", "pip", "wheel", "-q", "--no-deps", *options, "-w", str(folder), ".", env=env)
+    return max(folder.glob("*.whl"), key=lambda path: path.stat().st_mtime)
+
+
+def use_wheel(session: nox.Session, wheel: Path, python: str = "python", limits: tuple[str, ...] = PINNED) -> None:
+    """Install a wheel in an empty environment, and use every public name and README's examples; warnings are errors."""
+    session.run(python, "-m", "pip", "install", "-q", *limits, str(wheel), external=True)
+    session.run(python, "-m", "pip", "check", external=True)
+    session.run(python, "-I", "-W", "error", "-c", EVERY_NAME_AND_README, external=True)
+
+
+@nox.session(venv_backend="none")
+def tests(session: nox.Session) -> None:
+    """Run README's command for the tests, which leaves out those marked slow."""
+    run_readme(session, "pytest")
+
+
+@nox.session(venv_backend="none")
+def studies(session: nox.Session) -> None:
+    """Run README's command for the paper's studies, and compare the figures that the documentation quotes."""
+    run_readme(session, "comparisons", TQDM_MININTERVAL="20")
+    session.run(".venv/bin/python", "docs/quoted.py", "studies")
+
+
+@nox.session(venv_backend="none")
+def docs(session: nox.Session) -> None:
+    """Run README's command for the documentation; with DOCS_WITHOUT_TUTORIALS=1 the tutorials are not executed."""
+    shutil.rmtree("docs/_build", ignore_errors=True)
+    run_readme(session, "sphinx")
+
+
 @nox.session
 def lint(session: nox.Session) -> None:
-    """Run ruff, mypy, codespell, reuse, zizmor and Scientific Python's review."""
+    """Run ruff, mypy and the other hooks of .pre-commit-config.yaml."""
     session.install(*PINNED, "-e", ".[test]")
     install_group(session, "lint")
     session.run("pre-commit", "run", "--all-files", "--show-diff-on-failure", *session.posargs)
 
 
 @nox.session
-def tests(session: nox.Session) -> None:
-    """Run the tests, without those marked slow."""
+def wheel(session: nox.Session) -> None:
+    """Build the wheel, compare its files with the tree's, and use it in an environment of its own."""
+    built = build_wheel(session, folder=Path(session.create_tmp()).resolve())
+    packed = {name for name in zipfile.ZipFile(built).namelist() if ".dist-info/" not in name}
+    libraries = {name for name in packed if name.startswith("kfopc_filterpy/core/libanc-")}  # built, not in the tree
+    listing = ("git", "ls-files", "--cached", "--others", "--exclude-standard", "kfopc_filterpy")
+    expected = {name for name in session.run(*listing, external=True, silent=True).splitlines() if Path(name).exists()}
+    if different := expected ^ (packed - libraries):
+        session.error(f"these files are in the tree alone, or in the wheel alone: {sorted(different)}")
+    for real in ("double", "float"):
+        if not any(f"{real}-baseline" in name for name in libraries):
+            session.error(f"the wheel has no {real} library for every processor, but {sorted(libraries)}")
+    use_wheel(session, built)
+
+
+@nox.session(name="filterpy-1.4.5")
+def older_filterpy(session: nox.Session) -> None:
+    """Run the estimator's tests on filterpy 1.4.5."""
     session.install(*PINNED, "-e", ".[test]")
-    session.run("python", "-m", "pytest", *session.posargs)
+    session.install("--no-deps", "filterpy==1.4.5")
+    estimator = ["tests/filters", "-k", "test_estimator or test_random_walk or test_filterpy"]
+    session.run("python", "-m", "pytest", *estimator)
 
 
-@nox.session
-def docs(session: nox.Session) -> None:
-    """Build the documentation, with every page executed."""
-    session.install(*PINNED, "-e", ".[docs]")
-    session.run(*["python", "-m", "sphinx", "-W", "-j", "auto", "docs", "docs/_build/html"], *session.posargs)
+@nox.session(default=False)
+def bare(session: nox.Session) -> None:
+    """Install without a C compiler, where pip fetches zig's, and without a network, where it says what to install."""
+    tree, without_compiler = str(copy_tree(session)), {"PATH": "", "CC": None}
+    session.install("hatchling>=1.25")
+    said = session.run(
+        *("python", "-m", "pip", "install", "--no-deps", "--no-build-isolation", tree),
+        env={**without_compiler, "PIP_NO_INDEX": "1"},
+        success_codes=[1],
+        silent=True,
+    )
+    if not re.search(r"needs a C compiler: install gcc or clang .* -m pip install ziglang", said):
+        session.error(f"no line says what to install: {said}")
+    session.install("--no-deps", tree, env=without_compiler)
+    session.install(*PINNED, "--no-deps", "lazy-loader", "packaging")
+    load = "from kfopc_filterpy.core.library import load; print(load('double').path.name, load('float').path.name)"
+    session.run("python", "-I", "-c", load)
+
+
+@nox.session(default=False)
+def wheels(session: nox.Session) -> None:
+    """Make the wheels of all systems in dist/, with zig's compiler."""
+    session.install("hatchling>=1.25", "ziglang>=0.13")
+    zig = f"'{shutil.which('python', path=session.bin)}' -m ziglang cc"
+    own = {"CC": zig, "CFLAGS": None, "CPPFLAGS": None, "LDFLAGS": None}
+    dist = Path("dist")
+    shutil.rmtree(dist, ignore_errors=True)
+    for tag, target in SYSTEMS.items():
+        build_wheel(session, "--no-build-isolation", folder=dist, KFOPC_PLATFORM=tag, KFOPC_TARGET=target, **own)
+
+
+@nox.session(default=False, requires=["wheels"])
+def slow(session: nox.Session) -> None:
+    """Run the tests marked slow: other compilers and systems, all wheels, long runs, filterpy 1.4.5's own tests."""
+    session.install(*PINNED, "-e", ".[docs,test,fmu]")
+    session.install("sounddevice", "JACK-Client")
+    session.run("python", "-m", "pytest", "-m", "slow", *session.posargs, env={"KFOPC_WHEELS": "dist"})
+    session.install("--no-deps", "filterpy==1.4.5")
+    session.run("python", "-m", "pytest", "-m", "slow", "-n0", "tests/filters/test_filterpy_own_tests.py")
+
+
+@nox.session(default=False)
+def fuzz(session: nox.Session) -> None:
+    """Give the readers of files a minute of what atheris makes; skipped if there is no atheris for this Python."""
+    session.install(*PINNED, "-e", ".[test]")
+    try:
+        session.install("atheris>=3")
+    except nox.command.CommandFailed:
+        session.skip("atheris is not installed")
+    options = ("-max_total_time=60", "-print_final_stats=1", *session.posargs)
+    session.run("python", str(Path("tests/signals/fuzz_readers.py").resolve()), *options)
 
 
 @nox.session(default=False)
@@ -95,25 +221,17 @@ def ends_of_the_range(session: nox.Session, end: str) -> None:
     Without arguments, the tests of what is computed are run, not those of pages and figures. Warnings are errors.
     """
     work = Path(session.create_tmp()).resolve()
-    limits = []
+    limits: tuple[str, ...] = ()
     if end == "oldest":
         (work / "oldest.txt").write_text("\n".join(lower_bounds()), encoding="utf-8")
-        limits = ["-c", str(work / "oldest.txt")]
+        limits = ("-c", str(work / "oldest.txt"))
     session.install(*limits, "-e", ".[test]")
     session.run("python", "-m", "pip", "check")
     session.run("python", "-m", "pip", "freeze", "--exclude-editable")
     session.run("python", "-m", "pytest", *(session.posargs or COMPUTED))
-
-    # README's Install section, from the wheel in an empty environment: every public name, and README's examples.
-    session.run("python", "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(work / "dist"), ".")
     session.run("python", "-m", "venv", "--clear", str(work / "empty"))
-    python = str(work / "empty" / ("Scripts" if os.name == "nt" else "bin") / "python")
-    (wheel,) = (work / "dist").glob("*.whl")
-    session.run(python, "-m", "pip", "install", "-q", *limits, str(wheel), external=True)
-    session.run(python, "-m", "pip", "check", external=True)
-    (work / "README.md").write_bytes(Path("README.md").read_bytes())
-    with session.chdir(work):
-        session.run(python, "-I", "-W", "error", "-c", EVERY_NAME_AND_README, external=True)
+    python = work / "empty" / ("Scripts" if os.name == "nt" else "bin") / "python"
+    use_wheel(session, build_wheel(session, folder=work), str(python), limits)
 
 
 def lower_bounds() -> list[str]:
@@ -135,9 +253,7 @@ def mutants(session: nox.Session) -> None:
     The packages are the files in tests/mutants/, and so are the tests that must fail. Without a number, every mutant is run.
     """
     name, *number = session.posargs or ["power", "40"]
-    tree = Path(session.create_tmp()).resolve() / "tree"
-    shutil.rmtree(tree, ignore_errors=True)
-    session.run("git", "checkout-index", "--all", f"--prefix={tree}/", external=True)  # what is changed is a copy
+    tree = copy_tree(session)
     session.install(*PINNED, "-e", f"{tree}[test]")
     install_group(session, "mutants")
     with session.chdir(tree):
@@ -161,18 +277,6 @@ def keep_some(found: str, count: int) -> None:
         kept = [job for (job,) in random.Random(0).sample(waiting, count)]
         for table in ("work_results", "mutation_specs", "work_items"):
             database.execute(f"DELETE FROM {table} WHERE job_id NOT IN ({', '.join('?' * count)})", kept)
-
-
-@nox.session(venv_backend="none", default=False)
-def slow(session: nox.Session) -> None:
-    """Run the slow set: other compilers and systems, long runs, all wheels, a minute of fuzzing."""
-    session.run("bash", ".ci/slow", *session.posargs, external=True)
-
-
-@nox.session(venv_backend="none", default=False)
-def wheels(session: nox.Session) -> None:
-    """Make the wheels of all systems, in dist/ or the folder that is given."""
-    session.run("bash", ".ci/wheels", *session.posargs, external=True)
 
 
 if __name__ == "__main__":
