@@ -1,7 +1,7 @@
 """Compile the core for a wheel or for an editable installation.
 
-The machine's C compiler is taken, or where there is none, zig's, which pip then fetches as a wheel. `.ci/wheels` sets
-KFOPC_TARGET, a machine in zig's words, and KFOPC_PLATFORM, the tag of its wheel, to build for other machines.
+The machine's C compiler is taken, or where there is none, zig's, which pip then fetches as a wheel. `nox -s wheels`
+sets KFOPC_TARGET, a machine in zig's words, and KFOPC_PLATFORM, the tag of its wheel, to build for other machines.
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@
 # ///
 """Tasks: `nox -l` lists them, `nox -s docs` runs one. What follows `--` goes to pytest, Sphinx, the studies or cosmic-ray.
 
-`.ci/run` runs those marked with a star, `.ci/slow` runs bare, wheels, slow and fuzz; both bring nox.
+`.ci/run` runs those marked with a star, `.ci/slow` runs bare, wheels, slow and fuzz; both bring nox. Sessions that leave
+cores idle may run beside one another (`nox -j 2`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import os
 import random
 import re
 import shutil
+import signal
 import sqlite3
 import zipfile
 from pathlib import Path
@@ -24,6 +26,7 @@ import nox
 nox.needs_version = ">=2026.8.10"
 nox.options.default_venv_backend = "virtualenv"  # its environments have pip, which some sessions run
 nox.options.error_on_missing_interpreters = True
+signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, at which nox ends what runs beside
 
 PINNED = ("-c", "constraints.txt")
 PROJECT = nox.project.load_toml("pyproject.toml")
@@ -101,7 +104,7 @@ def tests(session: nox.Session) -> None:
     run_readme(session, "pytest")
 
 
-@nox.session(venv_backend="none")
+@nox.session(venv_backend="none", allow_parallel=True)
 def studies(session: nox.Session) -> None:
     """Run README's command for the paper's studies, and compare the figures that the documentation quotes."""
     run_readme(session, "comparisons", TQDM_MININTERVAL="20")
@@ -115,7 +118,7 @@ def docs(session: nox.Session) -> None:
     run_readme(session, "sphinx")
 
 
-@nox.session
+@nox.session(allow_parallel=True)
 def lint(session: nox.Session) -> None:
     """Run ruff, mypy and the other hooks of .pre-commit-config.yaml."""
     session.install(*PINNED, "-e", ".[test]")
@@ -123,7 +126,7 @@ def lint(session: nox.Session) -> None:
     session.run("pre-commit", "run", "--all-files", "--show-diff-on-failure", *session.posargs)
 
 
-@nox.session
+@nox.session(allow_parallel=True)
 def wheel(session: nox.Session) -> None:
     """Build the wheel, compare its files with the tree's, and use it in an environment of its own."""
     built = build_wheel(session, folder=Path(session.create_tmp()).resolve())
@@ -139,7 +142,7 @@ def wheel(session: nox.Session) -> None:
     use_wheel(session, built)
 
 
-@nox.session(name="filterpy-1.4.5")
+@nox.session(name="filterpy-1.4.5", allow_parallel=True)
 def older_filterpy(session: nox.Session) -> None:
     """Run the estimator's tests on filterpy 1.4.5."""
     session.install(*PINNED, "-e", ".[test]")

@@ -42,7 +42,7 @@ mathjax_path = "tex-svg-full.js"
 mathjax3_config = {"options": {"enableMenu": False}}  # the menu's settings load parts that are not in the file
 
 # Tutorials are MyST text notebooks, executed anew in every build; a cell that raises ends it.
-# .ci/run sets this variable: its tests have run the tutorials already.
+# .ci/run sets this variable: the tests run the tutorials, too.
 nb_execution_excludepatterns = ["tutorials/*"] if os.environ.get("DOCS_WITHOUT_TUTORIALS") else []
 nb_execution_mode = "force"
 nb_execution_timeout = 300

@@ -1,4 +1,4 @@
-"""The command `kfopc`, which is also `python -m kfopc_filterpy`: a file for each subcommand."""
+"""The command line of `kfopc`: a file for each subcommand."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 done or enough, 1 not enough or stopped by a fault, 2 wrong input, 130 interrupted, 141 nobody reads.
+        0 done or enough, 1 not enough or stopped by a fault, 2 wrong input, 141 nobody reads.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     options, unknown = whole_parser().parse_known_args(
@@ -57,9 +57,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
         print(f"{options.prog}: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
         return WRONG_INPUT
-    except KeyboardInterrupt:
-        print(f"{options.prog}: interrupted; each file is as it was, or was written whole", file=sys.stderr)
-        return 130
 
 
 def whole_parser() -> Parser:

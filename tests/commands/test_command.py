@@ -265,6 +265,17 @@ def test_a_reader_that_goes_away_ends_the_command_without_a_word():
     assert process.returncode == 141
 
 
+def test_an_interrupt_while_python_loads_the_command_gives_one_line(tmp_path):
+    """In the process, numpy is a file that is interrupted."""
+    (tmp_path / "numpy.py").write_text("raise KeyboardInterrupt", encoding="utf-8")
+    ended = subprocess.run(
+        [sys.executable, "-m", "kfopc_filterpy", "--version"], capture_output=True, text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
+    )  # fmt: skip
+    assert (ended.returncode, ended.stdout) == (130, "")
+    assert ended.stderr == "kfopc: interrupted; each file is as it was, or was written whole\n"
+
+
 def test_a_file_of_one_channel_is_left_alone_by_the_choice_of_a_channel(command):
     options = ["--rated-power", "4", "--taps", "32", "--json", "--algorithm", "FxLMS"]
     code, chosen, _ = command("verdict", "stereo.wav", *SCENE[1:], *options, "--channel", "1")

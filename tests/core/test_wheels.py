@@ -1,4 +1,4 @@
-"""The wheels that .ci/wheels made, in the folder that KFOPC_WHEELS names: what is in them, and the bits that they compute."""
+"""The wheels that `nox -s wheels` made, in the folder that KFOPC_WHEELS names: what is in them, and the bits that they compute."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def libraries(tag: str, folder: Path) -> dict[str, Path]:
     """Unpack the libraries of a wheel and return them by their names; skip the test if there are no wheels."""
     named = os.environ.get("KFOPC_WHEELS")
     if not named:
-        pytest.skip("KFOPC_WHEELS names no folder of wheels, as .ci/wheels makes them")
+        pytest.skip("KFOPC_WHEELS names no folder of wheels, as `nox -s wheels` makes them")
     (wheel,) = Path(named).glob(f"*-py3-none-{tag}.whl")
     with zipfile.ZipFile(wheel) as file:
         names = [name for name in file.namelist() if "/libanc-" in name]

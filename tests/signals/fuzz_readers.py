@@ -1,7 +1,7 @@
 """Gives the readers of files what atheris makes of valid ones: `python tests/signals/fuzz_readers.py -max_total_time=60`.
 
 A file is read, or refused by an error that names it, within 10 s and 1.5 GB; anything else ends the search, and atheris
-writes the input that did it. Further arguments are those of libFuzzer. `.ci/slow` runs it for a minute.
+writes the input that did it. Further arguments are those of libFuzzer. `nox -s fuzz` runs it for a minute.
 """
 
 import sys
