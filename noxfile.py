@@ -62,14 +62,16 @@ raise SystemExit(failed > 0)
 """
 
 
-def run_readme(session: nox.Session, module: str, **env: str) -> None:
-    """Run README's line that installs what a module needs and runs it, word for word, in the `.venv` that it makes."""
+def run_readme(session: nox.Session, module: str, *written: str, **env: str) -> None:
+    """Run README's line that installs what a module needs and runs it, word for word, and look for what it has written."""
     form = rf"python3 -m venv \.venv && .+ && \.venv/bin/python -m {module}\b.*"
     lines = [line for line in Path("README.md").read_text(encoding="utf-8").splitlines() if re.fullmatch(form, line)]
     if len(lines) != 1:
         session.error(f"README.md must state one line of this form, and has {len(lines)}: {form}")
     line = lines[0].replace("/bin/", "/Scripts/") if os.name == "nt" else lines[0]
     session.run("sh", "-c", f'{line} "$@"', "sh", *session.posargs, env=env)
+    if missing := [name for name in written if not Path(name).is_file()]:
+        session.error(f"README's command has not written {missing}")
 
 
 def install_group(session: nox.Session, *groups: str) -> None:
@@ -107,7 +109,7 @@ def tests(session: nox.Session) -> None:
 @nox.session(venv_backend="none", allow_parallel=True)
 def studies(session: nox.Session) -> None:
     """Run README's command for the paper's studies, and compare the figures that the documentation quotes."""
-    run_readme(session, "comparisons", TQDM_MININTERVAL="20")
+    run_readme(session, "comparisons", "studies/report.html", TQDM_MININTERVAL="20")  # seconds, for a short log
     session.run(".venv/bin/python", "docs/quoted.py", "studies")
 
 
@@ -115,7 +117,7 @@ def studies(session: nox.Session) -> None:
 def docs(session: nox.Session) -> None:
     """Run README's command for the documentation; with DOCS_WITHOUT_TUTORIALS=1 the tutorials are not executed."""
     shutil.rmtree("docs/_build", ignore_errors=True)
-    run_readme(session, "sphinx")
+    run_readme(session, "sphinx", "docs/_build/html/index.html", "docs/_build/html/searchindex.js")
 
 
 @nox.session(allow_parallel=True)
@@ -187,7 +189,7 @@ def slow(session: nox.Session) -> None:
     """Run the tests marked slow: other compilers and systems, all wheels, long runs, filterpy 1.4.5's own tests."""
     session.install(*PINNED, "-e", ".[docs,test,fmu]")
     session.install("sounddevice", "JACK-Client")
-    session.run("python", "-m", "pytest", "-m", "slow", *session.posargs, env={"KFOPC_WHEELS": "dist"})
+    session.run("python", "-m", "pytest", "-m", "slow", *(session.posargs or ["tests"]), env={"KFOPC_WHEELS": "dist"})
     session.install("--no-deps", "filterpy==1.4.5")
     session.run("python", "-m", "pytest", "-m", "slow", "-n0", "tests/filters/test_filterpy_own_tests.py")
 
@@ -200,8 +202,9 @@ def fuzz(session: nox.Session) -> None:
         session.install("atheris>=3")
     except nox.command.CommandFailed:
         session.skip("atheris is not installed")
-    options = ("-max_total_time=60", "-print_final_stats=1", *session.posargs)
-    session.run("python", str(Path("tests/signals/fuzz_readers.py").resolve()), *options)
+    program = Path("tests/signals/fuzz_readers.py").resolve()
+    with session.chdir(session.create_tmp()):  # where atheris writes the input that ended the search
+        session.run("python", str(program), "-max_total_time=60", "-print_final_stats=1")
 
 
 @nox.session(default=False)
