@@ -181,7 +181,8 @@ def wheels(session: nox.Session) -> None:
     dist = Path("dist")
     shutil.rmtree(dist, ignore_errors=True)
     for tag, target in SYSTEMS.items():
-        build_wheel(session, "--no-build-isolation", folder=dist, KFOPC_PLATFORM=tag, KFOPC_TARGET=target, **own)
+        own |= {"KFOPC_PLATFORM": tag, "KFOPC_TARGET": target}
+        session.log(build_wheel(session, "--no-build-isolation", folder=dist, **own).name)
 
 
 @nox.session(default=False, requires=["wheels"])
