@@ -205,7 +205,7 @@ def fuzz(session: nox.Session) -> None:
         session.skip("atheris is not installed")
     program = Path("tests/signals/fuzz_readers.py").resolve()
     with session.chdir(session.create_tmp()):  # where atheris writes the input that ended the search
-        session.run("python", str(program), "-max_total_time=60", "-print_final_stats=1")
+        session.run("python", str(program), "-max_total_time=60", "-verbosity=0", "-print_final_stats=1")
 
 
 @nox.session(default=False)
