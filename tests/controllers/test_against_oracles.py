@@ -76,7 +76,6 @@ class Scene:
 
 
 ONE, SEVERAL = Scene(several=False), Scene(several=True)
-SCENES = [pytest.param(ONE, id="one channel"), pytest.param(SEVERAL, id="several")]
 
 
 def assert_close(got: Any, expected: Any, what: str) -> None:
@@ -191,100 +190,59 @@ def pair(name: str, scene: Scene, own: Any = None, known: Any = None, window: st
     return controller, oracle(**channels, **theirs, **(known or {}))
 
 
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("name", LMS)
-def test_lms(name: str, scene: Scene) -> None:
-    """A second; half of it with running powers, and a quarter of that with several channels: the oracles are slow."""
-    n = 8000 if name in WITH_POWERS else 16000
-    compare(scene, *pair(name, scene), n if scene.one else n // 4)
+def cases(*names: str) -> Any:
+    """Each algorithm with one channel, and with several if it takes them; the parameters of a test."""
+    scenes = {"one channel": ONE, "several": SEVERAL}
+    return pytest.mark.parametrize(
+        ("name", "scene"),
+        [
+            pytest.param(name, scene, id=f"{name}, {which}")
+            for name in names
+            for which, scene in scenes.items()
+            if scene is ONE or name in LMS or name in SEVERAL_KALMAN
+        ],
+    )
 
 
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("name", ["FxLMS", "FxNLMS", "leaky", "MOV", "two-gradient", "re-scaling"])
-def test_lms_with_a_guard(name: str, scene: Scene) -> None:
+@cases(*ALGORITHMS)
+def test_every_algorithm(name: str, scene: Scene) -> None:
+    compare(scene, *pair(name, scene), 4000 if scene.one else 3000)
+
+
+@cases("FxLMS", "FxNLMS", "leaky", "MOV", "two-gradient", "re-scaling", "KF-OPC", "diagonal KF-OPC", "repaired")
+def test_with_a_guard(name: str, scene: Scene) -> None:
     W = guard_filter(UNCERTAINTY, scene.s_hat)
     controller, oracle = pair(name, scene, known={"guard": W})
     controller.secondary_path_uncertainty = UNCERTAINTY
     compare(scene, controller, oracle, 2000)
 
 
-def limiters(scene: Scene) -> tuple[Any, list[Limiter]]:
-    """Limiters that act, of the package and of the oracle."""
-    settings: list[tuple[float, Any]] = [
+@cases("FxLMS", "MOV", "two-gradient", "re-scaling", "KF-ANC", "KF-OPC", "FxRLS", "repaired", "fast array")
+def test_with_limiters(name: str, scene: Scene) -> None:
+    """Limiters that act."""
+    limits: list[tuple[float, Any]] = [
         (0.01, {"fs": FS, "window_s": 0.01}),
         (0.02, {"fs": FS, "window_s": 0.013, "amplitude_limit": 0.3}),
     ]
-    own, theirs = ([make(p, **o) for p, o in settings] for make in (OutputLimiter, Limiter))
-    return scene.each(own), theirs[: scene.loudspeakers]
-
-
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("name", ["FxLMS", "MOV", "two-gradient", "re-scaling"])
-def test_lms_with_limiters(name: str, scene: Scene) -> None:
-    own, theirs = limiters(scene)
-    compare(scene, *pair(name, scene, {"limiter": own}, {"limiters": theirs}), 2000)
+    own, theirs = ([make(p, **o) for p, o in limits[: scene.loudspeakers]] for make in (OutputLimiter, Limiter))
+    compare(scene, *pair(name, scene, {"limiter": scene.each(own)}, {"limiters": theirs}), 2000)
     assert all(one.gain < 1.0 for one in theirs)
 
 
-def saturating(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A soft amplifier model, for the package and for the oracle."""
-    return {"amplifier": SoftSaturationAmplifier(0.2, 1.5)}, {
-        "amplifiers": [signals.rapp(0.2, 1.5)] * scene.loudspeakers
-    }
-
-
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("name", ["FxLMS", "optimal leaky", "MOV", "MOV modified"])
-def test_lms_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> None:
-    """The true amplifiers clip hard; who estimates the disturbance takes them for soft ones."""
-    own, known = saturating(scene) if name in WITH_POWERS else ({}, {})
+@cases(
+    "FxLMS", "optimal leaky", "MOV", "MOV modified", "KF-OPC", "diagonal KF-OPC", "FxRLS", "repaired", "fast array KF-OPC"
+)  # fmt: skip
+def test_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> None:
+    """The true amplifiers clip hard; a controller that estimates the disturbance takes them for soft ones."""
+    own, known = {}, {}
+    if name in WITH_POWERS or name in KALMAN:
+        own = {"amplifier": SoftSaturationAmplifier(0.2, 1.5)}
+        known = {"amplifiers": [signals.rapp(0.2, 1.5)] * scene.loudspeakers}
     both = pair(name, scene, own, known, window="sliding")
     compare(scene, *both, 2000, amplifier=HardClipAmplifier(0.15), played=signals.hard_clip(0.15))
 
 
-def kalman_cases(names: Any) -> list[Any]:
-    """Each algorithm with one channel; with several if it takes them."""
-    cases = [pytest.param(name, ONE, id=f"{name}, one channel") for name in names]
-    return cases + [pytest.param(name, SEVERAL, id=f"{name}, several") for name in names if name in SEVERAL_KALMAN]
-
-
-@pytest.mark.parametrize(("name", "scene"), kalman_cases(KALMAN))
-def test_kalman(name: str, scene: Scene) -> None:
-    compare(scene, *pair(name, scene), 3000)
-
-
-@pytest.mark.parametrize(("name", "scene"), kalman_cases(["KF-OPC", "diagonal KF-OPC", "repaired"]))
-def test_kalman_with_a_guard(name: str, scene: Scene) -> None:
-    W = guard_filter(UNCERTAINTY, scene.s_hat)
-    controller, oracle = pair(name, scene, known={"guard": W})
-    controller.secondary_path_uncertainty = UNCERTAINTY
-    compare(scene, controller, oracle, 2000)
-
-
-@pytest.mark.parametrize(("name", "scene"), kalman_cases(["KF-ANC", "KF-OPC", "FxRLS", "repaired", "fast array"]))
-def test_kalman_with_limiters(name: str, scene: Scene) -> None:
-    own, theirs = limiters(scene)
-    compare(scene, *pair(name, scene, {"limiter": own}, {"limiters": theirs}), 2000)
-    assert all(one.gain < 1.0 for one in theirs)
-
-
-@pytest.mark.parametrize(
-    ("name", "scene"), kalman_cases(["KF-OPC", "diagonal KF-OPC", "FxRLS", "repaired", "fast array KF-OPC"])
-)
-def test_kalman_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> None:
-    own, known = saturating(scene)
-    both = pair(name, scene, own, known, window="sliding")
-    compare(scene, *both, 2000, amplifier=HardClipAmplifier(0.15), played=signals.hard_clip(0.15))
-
-
-@pytest.mark.parametrize(
-    ("name", "scene"),
-    [
-        *kalman_cases(["KF-OPC", "diagonal KF-OPC", "FxRLS", "fast array KF-OPC", "fast array, finite", "repaired"]),
-        pytest.param("MOV", ONE, id="MOV, one channel"),
-        pytest.param("MOV", SEVERAL, id="MOV, several"),
-    ],
-)
+@cases("KF-OPC", "diagonal KF-OPC", "FxRLS", "fast array KF-OPC", "fast array, finite", "repaired", "MOV")
 def test_control_that_is_switched_on_later(name: str, scene: Scene) -> None:
     compare(scene, *pair(name, scene), 2000, on=400)
 
@@ -304,9 +262,9 @@ def test_a_loudspeaker_that_no_microphone_hears(unheard: list[int], name: str) -
     assert np.any(controller.weights != 0.0) == (len(unheard) == 1)
 
 
-@pytest.mark.parametrize("amplitude_limit", [None, 0.5], ids=["", "amplitude limit"])
+@pytest.mark.parametrize("limit", [{}, {"amplitude_limit": 0.5}], ids=["", "amplitude limit"])
 @pytest.mark.parametrize("window_s", [0.01, 0.0005], ids=["160 samples", "8 samples"])
-def test_limiter(amplitude_limit: float | None, window_s: float) -> None:
+def test_limiter(limit: dict[str, float], window_s: float) -> None:
     """Noise, silence, a burst, a tone: after silence, the first loud samples spend the whole budget.
 
     A clipped sample is the root of what is left of the budget; when nothing is left, roundings of 1e-16 of the budget are
@@ -316,7 +274,6 @@ def test_limiter(amplitude_limit: float | None, window_s: float) -> None:
     u = np.concatenate(
         [0.2 * rng.standard_normal(3000), np.zeros(500), 20.0 * rng.standard_normal(300), 0.5 * np.sin(0.3 * n)]
     )
-    limit = {} if amplitude_limit is None else {"amplitude_limit": amplitude_limit}
     own, theirs = (make(0.04, fs=FS, window_s=window_s, **limit) for make in (OutputLimiter, Limiter))
     y, expected = own.process(u), np.array([theirs(v) for v in u])
     budget = 0.04 * round(window_s * FS)

@@ -11,7 +11,6 @@ from kfopc_filterpy import DiagonalKalman, kf_anc, simulate
 
 L = 6
 PATH = np.array([0.0, 0.8, -0.3])
-NOISES: dict[str, Any] = {"state_noise": 1e-5, "measurement_noise": 0.02, "initial_variance": 0.7}
 
 
 def signals(n: int = 400, colour: tuple[float, ...] = (1.0,)) -> tuple[np.ndarray, np.ndarray]:
@@ -62,10 +61,3 @@ def test_a_step_that_would_be_too_large_is_left_out() -> None:
     controller.control_signal(1e-40)
     controller.update(1.0)
     assert controller.weights[0] == pytest.approx(1e40)
-
-
-@pytest.mark.parametrize("name", ["state_noise", "measurement_noise", "initial_variance"])
-@pytest.mark.parametrize("value", [-1.0, np.nan, 1e51])
-def test_bad_variances_are_refused(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=name):
-        DiagonalKalman(L, PATH, **(NOISES | {name: value}))

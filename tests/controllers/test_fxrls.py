@@ -32,12 +32,3 @@ def test_the_weights_are_the_weighted_least_squares(forgetting: float) -> None:
     weight = forgetting ** np.arange(x.size - 1, -1, -1.0)
     normal = H.T @ (weight[:, None] * H) + forgetting**x.size / 2.0 * np.eye(L)
     np.testing.assert_allclose(controller.weights, np.linalg.solve(normal, H.T @ (weight * d)), rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("forgetting", 0.0), ("forgetting", 1.1), ("forgetting", np.nan), ("initial_variance", 0.0), ("n_taps", 0)],
-)
-def test_settings_out_of_range_are_refused(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=name):
-        fx_rls(**({"n_taps": L, "secondary_path": PATH} | {name: value}))

@@ -11,20 +11,15 @@ import pytest
 from helpers.comparing import assert_same_run
 
 from kfopc_filterpy import (
-    KFOPC,
     ClippingFxLMS,
-    FastArrayKalman,
     FxLMS,
     FxNLMS,
     HardClipAmplifier,
-    KalmanController,
     LeakyFxLMS,
     MOVFxLMS,
-    OutputLimiter,
     OutputPowerConstraint,
     RescalingFxLMS,
     TwoGradientFxLMS,
-    fx_rls,
     output_power,
     simulate,
 )
@@ -124,28 +119,6 @@ def test_an_unplugged_loudspeaker_stays_silent_and_the_other_is_not_disturbed(na
     np.testing.assert_array_equal(with_it.error, without.error)
 
 
-def test_a_microphone_that_no_loudspeaker_reaches_is_left_as_it_is() -> None:
-    deaf = np.concatenate([PATHS, np.zeros((1, J, PATHS.shape[2]))])
-    x = noise()
-    d = np.concatenate([run(made("FxLMS", PATHS), x).disturbance, 5.0 * np.ones((1, x.shape[1]))])
-    with_it = simulate(made("FxLMS", deaf), x, disturbance=d, secondary_path=deaf, fs=FS)
-    without = simulate(made("FxLMS", PATHS), x, disturbance=d[:K], secondary_path=PATHS, fs=FS)
-    np.testing.assert_array_equal(with_it.control_signal, without.control_signal)
-    np.testing.assert_array_equal(with_it.error[K], 5.0)
-
-
-@pytest.mark.parametrize("difference", [0.0, 1e-8], ids=["identical", "nearly identical"])
-def test_identical_loudspeakers_share_the_work_of_one(difference: float) -> None:
-    """Singular, and yet the gradient from zero leads to the least weights: each plays half of what one alone would."""
-    alike = np.stack([PATHS[:, 0], PATHS[:, 0] + difference * PATHS[:, 1]], axis=1)
-    x, options = noise(3000), {"primary_path": PRIMARY, "fs": FS}
-    two, one = made("FxLMS", alike), FxLMS(L, alike[:, :1], step_size=2 * MU, n_references=I)
-    shared = simulate(two, x, secondary_path=alike, **options)
-    alone = simulate(one, x, secondary_path=alike[:, :1], **options)
-    np.testing.assert_allclose(shared.control_signal[0], shared.control_signal[1], rtol=0, atol=1e-4)
-    np.testing.assert_allclose(shared.control_signal.sum(axis=0), alone.control_signal[0], rtol=0, atol=1e-4)
-
-
 # ---- Where it settles
 
 
@@ -201,31 +174,6 @@ def test_several_references_need_no_channel_axes() -> None:
 
 
 # ---- Refusals
-
-
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
-    [
-        (lambda: FxLMS(L, np.ones((2, 4)), step_size=MU), ValueError, r"\(K microphones, J loudspeakers, taps\), got \(2, 4\)"),
-        (lambda: FxLMS(L, np.ones((64, 2, 3)), step_size=MU), ValueError, r"taps come last"),
-        (lambda: FxLMS(L, PATHS * np.nan, step_size=MU), ValueError, r"secondary_path must be finite"),
-        (lambda: FxLMS(L, PATHS, step_size=MU, n_references=0), ValueError, "n_references must be at least 1"),
-        (lambda: FxLMS(L, PATHS, step_size=MU, limiter=[OutputLimiter(1.0)] * 2), TypeError, "2 different OutputLimiters"),
-        (lambda: made("clipping FxLMS", ESTIMATE[:, :1]), ValueError, r"one for each of the 1 loudspeakers, \(1,\), got shape \(2,\)"),
-        (lambda: ClippingFxLMS(L, PATHS, step_size=MU, amplitude_limit=[1.0, 0.0]), ValueError, "amplitude_limit must be greater than 0"),
-        (lambda: LeakyFxLMS(L, PATHS, step_size=0.1, leak=[1.0, 11.0]), ValueError, r"step_size \* leak must be 1 at most, got 1.1"),
-        (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=[1.0] * 3), ValueError, "one for each of the 2 loudspeakers, got 3"),
-        (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=1.0, amplifier=[None]), TypeError, "each of the 2 loudspeakers"),
-        (lambda: MOVFxLMS(L, ONE_PATH, step_size=MU, rated_power=[1.0, 2.0]), ValueError, "must be one for one loudspeaker, got 2"),
-        (lambda: fx_rls(L, PATHS), ValueError, "fx_rls takes one channel, .* use kf_pb, .* FxNLMS"),
-        (lambda: KalmanController(KFOPC(L), PATHS), ValueError, "KalmanController takes one channel"),
-        (lambda: FastArrayKalman(L, PATHS, measurement_noise=1.0), ValueError, "FastArrayKalman takes one channel: .* with the setting n_references take several"),
-    ],
-    ids=range(14),
-)  # fmt: skip
-def test_settings_that_do_not_fit_are_refused(make: Callable[[], Any], error: type, message: str) -> None:
-    with pytest.raises(error, match=message):
-        make()
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.comparing import SIGNALS
 from helpers.loop import FEEDBACK, FS, MEMORY_S, P0, S_HAT, Q, R, S, noises, run
-from helpers.naming import plain
 
 from kfopc_filterpy import OutputPowerConstraint, kf_opc, kf_opc_repaired, noise_reduction_db, output_power, simulate
 from kfopc_filterpy.controllers.repaired import RepairedKFOPC
@@ -20,7 +18,6 @@ N_TAPS, TRIM_S, RATED_POWER = 10, 0.02, 0.3
 
 
 PUBLISHED: dict[str, Any] = {"gain_of": "reference", "trim_s": None, "factor_at": "measurement"}
-REPAIRED: dict[str, Any] = {"gain_of": "control", "trim_s": TRIM_S, "factor_at": "output"}
 
 
 def made(
@@ -105,24 +102,3 @@ def test_the_trim_keeps_the_rated_power_where_eq_13_misses_it() -> None:
 
 
 # ---- Refusals
-
-ESTIMATOR: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 0.1}
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"gain_of": "both"}, ValueError, "gain_of must be one of 'reference', 'control'"),
-        ({"factor_at": "input"}, ValueError, "factor_at must be one of 'measurement', 'output'"),
-        ({"trim_s": 0.0}, ValueError, "trim_s must be greater than 0 s"),
-        ({"trim_s": math.nan}, ValueError, "trim_s must be finite"),
-        ({"rated_power": 0.0}, ValueError, "rated_power must be greater than 0"),
-        ({"constraint": OutputPowerConstraint(1.0)}, ValueError, "give either rated_power= or constraint="),
-        ({"secondary_path": np.ones((2, 2, 4))}, ValueError, "RepairedKFOPC takes one channel"),
-        ({"secondary_path_gain": 1.0}, TypeError, "unexpected keyword"),
-    ],
-    ids=plain,
-)
-def test_settings_out_of_range(options: dict, error: type, message: str) -> None:
-    with pytest.raises(error, match=message):
-        kf_opc_repaired(**{"n_taps": 4, "secondary_path": S_HAT, "rated_power": 1.0} | ESTIMATOR | options)

@@ -96,22 +96,6 @@ def test_an_ample_rated_power_changes_nothing() -> None:
     np.testing.assert_array_equal(free.control_signal, ample.control_signal)
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"subfilters": np.ones(4)}, r"subfilters must be \(C, L\)"),
-        ({"subfilters": [[1.0, np.nan]]}, "subfilters must be finite"),
-        ({"rated_power": 0.0}, "rated_power must be"),
-        ({"state_noise": -1.0}, "state_noise must not be negative"),
-        ({"measurement_noise": 0.0}, "measurement_noise must be greater than 0"),
-        ({"memory_s": 0.0}, "memory_s must be"),
-    ],
-)
-def test_bad_settings_are_refused(change: dict[str, Any], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
-        SubfilterKalman(**{"subfilters": np.ones((2, 4)), "secondary_path": SECONDARY} | NOISES | change)
-
-
 def test_bad_calls_are_refused_and_change_nothing() -> None:
     bank = band_subfilters(broadband(), 5)
     tried, other = (SubfilterKalman(bank, SECONDARY, rated_power=0.1, fs=FS, **NOISES) for _ in range(2))

@@ -1,0 +1,128 @@
+"""Settings that a controller does not take: the refusal names the setting and says what is expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from helpers.channels import random_paths
+
+from kfopc_filterpy import (
+    KFOPC,
+    ClippingFxLMS,
+    DiagonalKalman,
+    FastArrayKalman,
+    FxLMS,
+    FxNLMS,
+    KalmanController,
+    LeakyFxLMS,
+    MOVFxLMS,
+    OptimalLeakyFxLMS,
+    OutputLimiter,
+    OutputPowerConstraint,
+    RescalingFxLMS,
+    TwoGradientFxLMS,
+    fx_rls,
+    kf_anc,
+    kf_opc,
+    kf_opc_repaired,
+    kf_pb,
+)
+from kfopc_filterpy.controllers import SubfilterKalman, leak_factor, penalty_factor
+
+L = 6
+PATH, PATHS = np.array([0.0, 0.8, -0.3]), random_paths(3, 2, 4, seed=1)
+BANK = np.ones((2, L))
+STEP, RATED = {"step_size": 0.1}, {"rated_power": 1.0}
+KALMAN = {"state_noise": 1e-5, "measurement_noise": 0.1, "initial_variance": 1.0}
+POWERS = {"disturbance_power": 1.0, "secondary_path_gain": 1.0}
+
+NUMBERS: dict[Callable[..., Any], dict[str, float]] = {
+    kf_anc: KALMAN,
+    kf_opc: KALMAN | RATED | {"fs": 8000.0},
+    kf_opc_repaired: KALMAN | RATED | {"trim_s": 1.0},
+    kf_pb: RATED | {"fs": 8000.0, "averaging_s": 1.0, "secondary_path_uncertainty": 0.1},
+    fx_rls: {"forgetting": 0.9, "initial_variance": 1.0},
+    DiagonalKalman: KALMAN,
+    FastArrayKalman: {"measurement_noise": 0.1, "initial_variance": 1.0, "forgetting": 0.9} | RATED,
+    FxLMS: STEP,
+    FxNLMS: STEP | {"regularization": 1.0},
+    LeakyFxLMS: STEP | {"leak": 0.1},
+    OptimalLeakyFxLMS: STEP | RATED,
+    MOVFxLMS: STEP | RATED | {"penalty_factor": 0.1},
+    TwoGradientFxLMS: STEP | {"amplitude_limit": 1.0, "output_step_size": 0.1},
+    RescalingFxLMS: STEP | {"amplitude_limit": 1.0},
+    ClippingFxLMS: STEP | {"amplitude_limit": 1.0},
+}
+
+
+@pytest.mark.parametrize("make", NUMBERS)
+def test_a_number_out_of_range_is_refused_by_its_name(make: Callable[..., Any]) -> None:
+    for name in NUMBERS[make]:
+        for bad in (-1.0, np.nan, np.inf, "1"):
+            with pytest.raises((ValueError, TypeError), match=name):
+                make(L, PATH, **NUMBERS[make] | {name: bad})
+
+
+# What does not go together, or with the number of channels, or is of no use.
+# fmt: off
+REFUSED: list[tuple[Callable[[], Any], str]] = [
+    (lambda: kf_anc(0, PATH, **KALMAN), "n_taps must be at least 1"),
+    (lambda: kf_anc(4.0, PATH, **KALMAN), "n_taps must be a whole number"),
+    (lambda: kf_anc(L, [], **KALMAN), "secondary_path must have at least 1 value"),
+    (lambda: kf_anc(L, PATHS, **KALMAN | {"measurement_noise": [0.1, 0.1]}), r"each of the 3 microphones, \(3,\), got"),
+    (lambda: kf_opc(L, PATH, **KALMAN), "give either rated_power= or constraint="),
+    (lambda: kf_opc(L, PATH, constraint=OutputPowerConstraint(1.0), **KALMAN | RATED), "give either rated_power="),
+    (lambda: kf_opc(L, PATH, constraint=1.0, **KALMAN), "constraint must be an OutputPowerConstraint"),
+    (lambda: kf_opc(L, PATHS, rated_power=[1.0] * 3, **KALMAN), "one for each of the 2 loudspeakers, got 3"),
+    (lambda: kf_opc_repaired(L, PATH, gain_of="both", **KALMAN | RATED), "gain_of must be one of 'reference', 'control'"),
+    (lambda: kf_opc_repaired(L, PATH, factor_at="input", **KALMAN | RATED), "factor_at must be one of"),
+    (lambda: kf_opc_repaired(L, PATHS, **KALMAN | RATED), "RepairedKFOPC takes one channel"),
+    (lambda: kf_pb(L, PATH, rated_power=None), "rated_power"),
+    (lambda: kf_pb(L, PATH, rated_power=[1.0, 1.0]), "rated_power"),
+    (lambda: kf_pb(L, PATH, secondary_path_uncertainty=np.ones((2, 1, 2, 3)), **RATED), r"must be \(M, n_taps\)"),
+    (lambda: kf_pb(L, PATH, secondary_path_uncertainty=1e4, **RATED), "must be at most 1000"),
+    (lambda: kf_pb(L, PATH, averaging_s=1e5, **RATED), "averaging_s must be at most"),
+    (lambda: kf_pb(L, PATH, amplifier="loud", **RATED), "amplifier must be None"),
+    (lambda: fx_rls(L, PATH, forgetting=1.1), "forgetting"),
+    (lambda: fx_rls(L, PATHS), "fx_rls takes one channel, .* use kf_pb"),
+    (lambda: DiagonalKalman(L, PATH, **KALMAN | {"initial_variance": 1e51}), "initial_variance"),
+    (lambda: FastArrayKalman(L, PATHS, measurement_noise=1.0), "FastArrayKalman takes one channel"),
+    (lambda: FastArrayKalman(L, PATH, measurement_noise=1.0, memory=2 * L - 1), "memory must be 2 n_taps = 12"),
+    (lambda: FastArrayKalman(L, PATH, measurement_noise=1.0, memory=100, forgetting=0.9), "give either memory or"),
+    (lambda: FastArrayKalman(L, PATH, measurement_noise=1.0, memory=2**23 + 1), "out of its range"),
+    (lambda: FastArrayKalman(L, PATH, measurement_noise=1.0, forgetting=1.001), "forgetting must be 1 at most"),
+    (lambda: KalmanController(None, PATH), "estimator must be a filterpy KalmanFilter, got NoneType"),
+    (lambda: KalmanController(KalmanFilter(4, 2), PATH), "one measurement, dim_z = 1, got dim_z = 2"),
+    (lambda: KalmanController(KFOPC(L), PATHS), "KalmanController takes one channel"),
+    (lambda: KalmanController(KFOPC(4), PATH, amplifier=abs), "one of kfopc_filterpy's amplifier models"),
+    (lambda: MOVFxLMS(L, PATH, amplifier=abs, **STEP | RATED), "amplifier models"),
+    (lambda: MOVFxLMS(L, PATHS, amplifier=[None], **STEP | RATED), "each of the 2 loudspeakers"),
+    (lambda: MOVFxLMS(L, PATH, rated_power=[1.0, 2.0], **STEP), "must be one for one loudspeaker, got 2"),
+    (lambda: LeakyFxLMS(L, PATHS, leak=[1.0, 11.0], **STEP), r"step_size \* leak must be 1 at most, got 1.1"),
+    (lambda: ClippingFxLMS(L, PATHS, amplitude_limit=[1.0, 0.0], **STEP), "amplitude_limit must be greater than 0"),
+    (lambda: ClippingFxLMS(L, PATHS, amplitude_limit=[1.0], **STEP), "one for each of the 2 loudspeakers"),
+    (lambda: FxLMS(L, PATHS[0], **STEP), r"\(K microphones, J loudspeakers, taps\), got \(2, 4\)"),
+    (lambda: FxLMS(L, np.ones((64, 2, 3)), **STEP), "taps come last"),
+    (lambda: FxLMS(L, PATHS * np.nan, **STEP), "secondary_path must be finite"),
+    (lambda: FxLMS(L, PATHS, n_references=0, **STEP), "n_references must be at least 1"),
+    (lambda: FxLMS(L, PATHS, limiter=[OutputLimiter(1.0)] * 2, **STEP), "2 different OutputLimiters"),
+    (lambda: penalty_factor(1.0, **POWERS | {"disturbance_power": np.nan}), "disturbance_power"),
+    (lambda: leak_factor(1.0, **POWERS, reference_power=-1.0), "reference_power"),
+    (lambda: SubfilterKalman(np.ones(4), PATH, **KALMAN), r"subfilters must be \(C, L\)"),
+    (lambda: SubfilterKalman(np.nan * BANK, PATH, **KALMAN), "subfilters must be finite"),
+    (lambda: SubfilterKalman(BANK, PATH, **KALMAN, rated_power=0.0), "rated_power must be"),
+    (lambda: SubfilterKalman(BANK, PATH, **KALMAN | {"state_noise": -1.0}), "state_noise must not be negative"),
+    (lambda: SubfilterKalman(BANK, PATH, **KALMAN | {"measurement_noise": 0.0}), "measurement_noise must be greater"),
+    (lambda: SubfilterKalman(BANK, PATH, **KALMAN, memory_s=0.0), "memory_s must be"),
+]
+# fmt: on
+
+
+@pytest.mark.parametrize(("make", "message"), REFUSED, ids=[message for _, message in REFUSED])
+def test_what_does_not_fit_is_refused(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=message):
+        make()
