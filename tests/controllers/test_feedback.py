@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.controllers import quickly_verified, short_blocks
-from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MU, N_TAPS, P0, S_HAT, Q, R, S, noises
+from helpers.controllers import MAKERS, quickly_verified
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, S, noises
 
-from kfopc_filterpy import FxLMS, LimitedController, OutputLimiter, OutputPowerConstraint, kf_anc, kf_opc, simulate
+from kfopc_filterpy import FxLMS, LimitedController, OutputLimiter, simulate
 from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.paths import fir_path
-
-KALMAN: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
 
 
 class Proportional:
@@ -27,27 +25,23 @@ class Proportional:
         pass
 
 
-MAKERS: dict[str, Any] = {
-    "FxLMS": lambda: FxLMS(N_TAPS, S_HAT, step_size=MU),
-    "KF-ANC": lambda: kf_anc(N_TAPS, S_HAT, **KALMAN),
-    "KF-OPC": lambda: kf_opc(N_TAPS, S_HAT, constraint=OutputPowerConstraint(0.3, fs=FS), **KALMAN),
-    "KF-PB": lambda: short_blocks(N_TAPS, S_HAT, rated_power=0.3),
-    "verified path": lambda: quickly_verified(FxLMS(N_TAPS, S_HAT, step_size=MU)),
+CASES: dict[str, Any] = {name: MAKERS[name] for name in ("FxLMS", "KF-ANC", "KF-OPC", "KF-PB")} | {
+    "verified path": lambda: quickly_verified(MAKERS["FxLMS"]()),
     "limited": lambda: LimitedController(Proportional(), OutputLimiter(0.05, fs=FS, window_s=0.01)),
     "own": Proportional,
 }
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", CASES)
 def test_with_the_true_path_nothing_is_left_of_the_feedback(name: str) -> None:
     x, d, _ = noises()
     plant: dict[str, Any] = {"disturbance": d, "secondary_path": S, "fs": FS}
     if name not in ("own", "limited"):
         plant["switch_on_s"] = 20 / FS
-    free = simulate(MAKERS[name](), x, **plant)
-    neutral = simulate(FeedbackNeutralizer(MAKERS[name](), FEEDBACK), x, feedback_path=FEEDBACK, **plant)
+    free = simulate(CASES[name](), x, **plant)
+    neutral = simulate(FeedbackNeutralizer(CASES[name](), FEEDBACK), x, feedback_path=FEEDBACK, **plant)
     np.testing.assert_allclose(neutral.error, free.error, rtol=0, atol=1e-10)
-    fed_back = simulate(MAKERS[name](), x, feedback_path=FEEDBACK, **plant)
+    fed_back = simulate(CASES[name](), x, feedback_path=FEEDBACK, **plant)
     assert np.abs(fed_back.error - free.error).max() > 1e-3
 
 
@@ -94,7 +88,7 @@ def test_it_subtracts_what_a_known_amplifier_delivers() -> None:
 
 
 def test_what_was_played_before_a_pause_is_still_subtracted() -> None:
-    one, other = FeedbackNeutralizer(Recorder(), [0.0, 0.5, 0.25]), Recorder()
+    one = FeedbackNeutralizer(Recorder(), [0.0, 0.5, 0.25])
     one.control_signal(1.0)  # plays 1
     one.update(0.0)
     one.listen([0.5, 0.25, 0.0], [0.0, 0.0, 0.0])  # just the feedback
@@ -102,7 +96,9 @@ def test_what_was_played_before_a_pause_is_still_subtracted() -> None:
     assert copy.deepcopy(one).control_signal(2.0) == 2.0
     with pytest.raises(ValueError, match="listen"):
         FeedbackNeutralizer(Proportional(), [0.0, 1.0]).listen([0.0], [0.0])
-    other.listen(np.ones(1), np.ones(1))
+
+
+ONE, SEVERAL = MAKERS["FxLMS"](), FxLMS(4, np.ones((2, 3, 4)), step_size=0.1, n_references=2)
 
 
 def test_listening_leaves_the_users_amplifier_alone() -> None:
@@ -135,23 +131,25 @@ class Recorder:
         self.heard = references
 
 
-def test_what_is_refused() -> None:
-    one, several = MAKERS["FxLMS"](), FxLMS(4, np.ones((2, 3, 4)), step_size=0.1, n_references=2)
-    with pytest.raises(ValueError, match="delay of a sample at least"):
-        FeedbackNeutralizer(one, [0.1, 0.2])
-    with pytest.raises(ValueError, match=r"must be \(taps,\) for a controller of one channel"):
-        FeedbackNeutralizer(one, np.zeros((1, 1, 4)))
-    with pytest.raises(ValueError, match=r"must be \(I references, J loudspeakers, taps\)"):
-        FeedbackNeutralizer(several, [0.0, 1.0])
-    with pytest.raises(ValueError, match=r"n_references of 2, got \(1, 3, 4\)"):
-        FeedbackNeutralizer(several, np.zeros((1, 3, 4)))
-    with pytest.raises(ValueError, match=r"n_loudspeakers of 3, got \(2, 2, 4\)"):
-        FeedbackNeutralizer(several, np.zeros((2, 2, 4)))
-    with pytest.raises(TypeError, match="amplifier must be a function"):
-        FeedbackNeutralizer(one, [0.0, 1.0], amplifier=2.0)
-    with pytest.raises(TypeError, match="controller must have control_signal"):
-        FeedbackNeutralizer(3, [0.0, 1.0])  # type: ignore[arg-type]
-    neutral = FeedbackNeutralizer(one, fir_path([0.0, 1.0], FS))
+@pytest.mark.parametrize(
+    ("controller", "path", "options", "message"),
+    [
+        (ONE, [0.1, 0.2], {}, "delay of a sample at least"),
+        (ONE, np.zeros((1, 1, 4)), {}, r"must be \(taps,\) for a controller of one channel"),
+        (SEVERAL, [0.0, 1.0], {}, r"must be \(I references, J loudspeakers, taps\)"),
+        (SEVERAL, np.zeros((1, 3, 4)), {}, r"n_references of 2, got \(1, 3, 4\)"),
+        (SEVERAL, np.zeros((2, 2, 4)), {}, r"n_loudspeakers of 3, got \(2, 2, 4\)"),
+        (ONE, [0.0, 1.0], {"amplifier": 2.0}, "amplifier must be a function"),
+        (3, [0.0, 1.0], {}, "controller must have control_signal"),
+    ],
+)
+def test_what_does_not_fit_is_refused(controller: Any, path: Any, options: dict[str, Any], message: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=message):
+        FeedbackNeutralizer(controller, path, **options)
+
+
+def test_a_feedback_path_is_for_its_sample_rate() -> None:
+    neutral = FeedbackNeutralizer(ONE, fir_path([0.0, 1.0], FS))
     with pytest.raises(ValueError, match="feedback path is for 8000 Hz"):
         simulate(neutral, np.ones(5), primary_path=[1.0], secondary_path=[1.0], fs=16000.0)
     assert repr(neutral).startswith("<FxLMS with feedback neutralisation: 2 taps, <FxLMS: 10 taps")
