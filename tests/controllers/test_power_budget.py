@@ -9,7 +9,7 @@ import pytest
 from helpers.channels import random_paths
 from scipy.signal import butter, lfilter
 
-from kfopc_filterpy import HardClipAmplifier, kf_pb, noise_reduction_db, output_power, simulate
+from kfopc_filterpy import kf_pb, noise_reduction_db, output_power, simulate
 from kfopc_filterpy.controllers import PowerBudgetController
 from kfopc_filterpy.paths import PathTolerance, fir_path, misalignment_db
 from kfopc_filterpy.paths.uncertainty import rms_relative_error
@@ -26,10 +26,6 @@ SETTINGS: dict[str, Any] = {"rated_power": 0.25, "fs": FS, "averaging_s": AVERAG
 
 def made(path: Any = S, **settings: Any) -> PowerBudgetController:
     return kf_pb(L, path, **SETTINGS | settings)
-
-
-def several(**settings: Any) -> PowerBudgetController:
-    return made(PATHS, **{"n_references": I, "rated_power": [0.02, 0.05]} | settings)
 
 
 def noise(seconds: float, seed: int = 0, channels: int | None = None) -> np.ndarray:
@@ -75,20 +71,8 @@ def test_the_spread_is_the_rms_of_the_error_over_the_spectrum_of_the_path() -> N
 # ---- What it tells
 
 
-def test_shapes_for_one_channel() -> None:
-    controller = made()
-    run(controller, noise(1.0))
-    assert controller.weights.shape == controller.control_filter.shape == (L,)
-    assert controller.primary_path.shape == (L + M - 1,)
-    assert controller.identified_path.shape == controller.secondary_path.shape == (M,)
-    for name in ("rated_power", "power_weight", "measurement_noise"):
-        assert isinstance(getattr(controller, name), float)
-    assert isinstance(controller.alarms, int)
-    assert repr(controller) == "<KF-PB: 16 taps, rated power 0.25, constraint factor 1>"
-
-
 def test_shapes_for_several_channels() -> None:
-    controller = several()
+    controller = made(PATHS, n_references=I, rated_power=[0.02, 0.05])
     result = run(controller, noise(1.0, channels=I))
     assert result.control_signal.shape == (J, round(FS))
     assert controller.weights.shape == controller.control_filter.shape == (J, I, L)
@@ -111,13 +95,6 @@ def test_it_learns_both_paths() -> None:
     assert controller.alarms == 0
 
 
-def test_the_price_is_recorded() -> None:
-    result = run(made(rated_power=0.05), noise(3.0), record_powers=True)
-    assert result.power_weight.shape == result.error.shape
-    assert result.power_weight[-1] > 0.0
-    assert np.all(run(made(rated_power=1e3), noise(3.0), record_powers=True).power_weight >= 0.0)
-
-
 # ---- Runs
 
 
@@ -129,13 +106,6 @@ def test_the_power_is_kept_over_any_averaging_time_and_used() -> None:
     assert worst_mean(result.control_signal) < 1.05 * 0.25
     assert output_power(result.control_signal[-round(3 * FS) :], steady=1.0) > 0.5 * 0.25
     assert noise_reduction_db(result.error, result.disturbance) > 2.0
-
-
-def test_powers_of_several_loudspeakers_are_kept() -> None:
-    controller = several()
-    result = run(controller, noise(10.0, channels=I))
-    for y, rated in zip(result.control_signal, controller.rated_power, strict=True):
-        assert worst_mean(y) < 1.05 * rated
 
 
 def test_a_rated_power_that_is_assigned_during_a_run_holds_from_then_on() -> None:
@@ -177,15 +147,10 @@ def test_what_is_played_is_spent_while_it_does_not_adapt() -> None:
 # ---- Verification
 
 
-def flipped(**settings: Any) -> tuple[PowerBudgetController, Any]:
-    """A controller whose secondary path gets the other polarity after six seconds, and its run from then on."""
-    controller = made(rated_power=1.0, **settings)
-    run(controller, noise(6.0))
-    return controller, run(controller, noise(12.0, 1), secondary_path=-S)
-
-
 def test_a_path_whose_polarity_flips_raises_an_alarm_and_is_learnt_again() -> None:
-    controller, result = flipped()
+    controller = made(rated_power=1.0)
+    run(controller, noise(6.0))
+    result = run(controller, noise(12.0, 1), secondary_path=-S)
     assert controller.alarms >= 1
     assert misalignment_db(controller.identified_path, -S) < -10.0
     last = slice(-round(3 * FS), None)
@@ -214,12 +179,6 @@ def test_the_account_has_a_hard_end() -> None:
     assert np.any(result.control_signal[-round(FS) :])
 
 
-def test_an_exact_path_is_never_doubted() -> None:
-    controller, _ = flipped(secondary_path_uncertainty=None)
-    np.testing.assert_array_equal(controller.identified_path, controller.secondary_path)
-    assert controller.alarms > 0  # as if the primary path had changed
-
-
 def test_a_wrong_polarity_from_the_start_does_not_make_the_noise_much_louder() -> None:
     controller = made(-S, rated_power=1.0)
     result = run(controller, noise(12.0), switch_on_s=2.0)
@@ -229,26 +188,4 @@ def test_a_wrong_polarity_from_the_start_does_not_make_the_noise_much_louder() -
     assert changes[-1] < -3.0
 
 
-def test_a_new_path_is_learnt_around_and_the_control_filter_stays() -> None:
-    controller = made(rated_power=1.0)
-    run(controller, noise(6.0))
-    weights = controller.weights
-    controller.secondary_path = -S
-    np.testing.assert_array_equal(controller.weights, weights)
-    np.testing.assert_array_equal(controller.secondary_path, -S)
-    np.testing.assert_array_equal(controller.identified_path, -S)
-    result = run(controller, noise(6.0, 1), secondary_path=-S)
-    assert controller.alarms == 0
-    assert noise_reduction_db(result.error, result.disturbance) > 6.0
-
-
 # ---- With a limiter, and an amplifier
-
-
-def test_a_known_amplifier_is_no_error_of_the_path() -> None:
-    amplifier = HardClipAmplifier(0.5)
-    known = made(rated_power=1.0, amplifier=amplifier)
-    result = run(known, noise(8.0), amplifier=amplifier)
-    assert known.alarms == 0
-    assert misalignment_db(known.identified_path, S) < -15.0
-    assert noise_reduction_db(result.error, result.disturbance) > 1.0

@@ -7,11 +7,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from helpers.controllers import ALL
+from helpers.simulation import Integrator
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kfopc_filterpy import FxLMS, FxNLMS, HardClipAmplifier, OutputLimiter, kf_anc, kf_opc, kf_pb, simulate
-from kfopc_filterpy.controllers import VerifiedController, VirtualMicrophones
+from kfopc_filterpy.controllers import VerifiedController
 from kfopc_filterpy.controllers.posterior import BLOCK_S
 from kfopc_filterpy.controllers.verified import FIRST_PAUSE_S, HOLD_S, LEAST_VOLUME, STEP_S
 from kfopc_filterpy.paths import PathTolerance
@@ -259,13 +261,6 @@ def test_a_control_signal_that_is_not_finite_is_silence_and_another_start(value:
     assert np.any(y[-100:])
 
 
-def test_a_control_signal_that_is_never_finite_is_one_event() -> None:
-    x, d = noises(1.0)
-    controller = verified(Own(0))
-    assert not run(controller, x, d, S)[1].any()
-    assert names(controller) == ["not finite"]
-
-
 def test_blocks_around_a_controller_that_states_no_channels() -> None:
     x, d = noises(0.2)
     blocks, steps = verified(Own(10**6)), verified(Own(10**6))
@@ -362,29 +357,29 @@ def test_with_the_amplifier_known_the_path_is_learned_although_it_clips() -> Non
     assert left[1] < 0.1 < left[0]
 
 
-def test_what_is_refused() -> None:
-    class WithoutPath:
-        def control_signal(self, reference: float) -> float:
-            return reference
+FXLMS = MAKERS["FxLMS"]()
 
-        def update(self, error: float) -> None:
-            pass
 
-    fxlms = MAKERS["FxLMS"]()
-    virtual = VirtualMicrophones(FxLMS(4, PATHS[1:], step_size=0.1), PATHS, np.ones((1, 1, 1)), physical=[0])
-    with pytest.raises(TypeError, match="must have control_signal"):
-        verified(1.0)
-    with pytest.raises(TypeError, match="must have secondary_path and n_taps"):
-        verified(WithoutPath())
-    with pytest.raises(TypeError, match="virtual microphones have other paths"):
-        verified(virtual)
-    for itself in (kf_pb(L, S, rated_power=1.0, fs=FS), verified(fxlms)):
-        with pytest.raises(ValueError, match="verifies its path itself"):
-            verified(itself)
-    for name in ("fs", "memory_s"):
-        with pytest.raises(ValueError, match=name):
-            verified(fxlms, **{name: 0.0})
+@pytest.mark.parametrize(
+    ("controller", "settings", "message"),
+    [
+        (1.0, {}, "must have control_signal"),
+        (Integrator(), {}, "must have secondary_path and n_taps"),
+        (ALL["VirtualMicrophones"](), {}, "virtual microphones have other paths"),
+        (kf_pb(L, S, rated_power=1.0, fs=FS), {}, "verifies its path itself"),
+        (verified(FXLMS), {}, "verifies its path itself"),
+        (FXLMS, {"fs": 0.0}, "fs"),
+        (FXLMS, {"memory_s": 0.0}, "memory_s"),
+    ],
+)
+def test_what_cannot_be_verified_is_refused(controller: Any, settings: dict[str, float], message: str) -> None:
+    with pytest.raises((TypeError, ValueError), match=message):
+        verified(controller, **settings)
+
+
+def test_a_run_at_another_rate_and_a_path_that_is_too_long_are_refused() -> None:
+    controller = verified(FXLMS)
     with pytest.raises(ValueError, match="verification is for 2000 Hz: make it with the fs of the run"):
-        simulate(verified(fxlms), np.ones(9), disturbance=np.ones(9), secondary_path=S, fs=8000.0)
+        simulate(controller, np.ones(9), disturbance=np.ones(9), secondary_path=S, fs=8000.0)
     with pytest.raises(ValueError, match="at most the 16 taps"):
-        verified(fxlms).secondary_path = np.ones(17)
+        controller.secondary_path = np.ones(17)

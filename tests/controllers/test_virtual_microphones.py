@@ -132,12 +132,6 @@ def test_listening_leaves_the_users_amplifier_alone() -> None:
     np.testing.assert_allclose(got.error, want.error, rtol=0, atol=1e-12)
 
 
-def test_with_other_filters_it_is_not() -> None:
-    exact, wrong = run(made()), run(made(-OBSERVATION))
-    reductions = [noise_reduction_db(r.error[VIRTUAL], r.disturbance[VIRTUAL]) for r in (exact, wrong)]
-    assert reductions[0] > 1.0 > 0.0 > reductions[1]
-
-
 def test_known_amplifiers_keep_the_estimate_right_when_they_clip() -> None:
     signals = 2.0 * np.random.default_rng(4).standard_normal((J, 300))
     clip = [HardClipAmplifier(0.5), HardClipAmplifier(1.0)]
@@ -235,13 +229,11 @@ def test_the_estimate_is_the_conditional_mean_of_gaussian_signals(direct: bool) 
     ("call", "message"),
     [
         (lambda c: c.update([0.1, np.nan, 0.2, np.inf]), "error must be finite, but that of microphone 3 is inf"),
-        (lambda c: c.update([0.1, 0.2]), "error must have a value for each of the 4 microphones, got 2"),
         (lambda c: c.update([1e200, 0.0, 0.0, 0.0]), "error must not be louder than"),
         (lambda c: c.listen(np.ones((1, 9)), np.ones((3, 9))), r"with K = 4, .* got \(3, 9\)"),
         (lambda c: c.listen(np.ones((2, 9)), np.ones((4, 9))), r"references must be \(1, n_samples\)"),
-        (lambda c: c.control_signal([1.0, 2.0]), "reference must have a value for each of the 1 references"),
     ],
-    ids=["nan", "count", "overflow", "listening", "listening to more", "reference"],
+    ids=["nan", "overflow", "listening", "listening to more"],
 )
 def test_signals_that_do_not_fit_are_refused_with_nothing_changed(call: Callable[[Any], Any], message: str) -> None:
     refusing, twin = made(), made()
@@ -256,19 +248,13 @@ def test_signals_that_do_not_fit_are_refused_with_nothing_changed(call: Callable
     ("changed", "error", "message"),
     [
         ({"physical": [0, 4]}, ValueError, r"physical must be different indices of the 4 microphones .* got \[0, 4\]"),
-        ({"physical": [1, 1]}, ValueError, "physical must be different indices"),
-        ({"physical": []}, ValueError, "physical must be different indices"),
         ({"virtual": [-1]}, ValueError, "virtual must be at least 0"),
         ({"physical": [0, 1, 2, 3], "virtual": None}, ValueError, "virtual must name a microphone"),
         ({"observer": np.ones((2, 3, 4))}, ValueError, "from the 2 physical to the 2 virtual .* leads from 3 to 2"),
         ({"observer": np.ones((2, 2))}, ValueError, r"filters \(K_v, K_p, n_taps\), got shape \(2, 2\)"),
-        ({"observer": np.full((2, 2, 1), np.nan)}, ValueError, "observer must be finite"),
-        ({"observer": "none"}, TypeError, "observer must be a sequence of real numbers"),
         ({"controller": FxLMS(TAPS, SECONDARY, step_size=0.1)}, ValueError, "for the 2 virtual .* n_microphones is 4"),
         ({"controller": FxLMS(TAPS, SECONDARY[:2, :1], step_size=0.1)}, ValueError, "n_loudspeakers is 1"),
         ({"controller": FxLMS}, TypeError, "controller must have control_signal"),
-        ({"amplifier": [HardClipAmplifier(1.0)]}, TypeError, "one for each of the 2 loudspeakers"),
-        ({"secondary_path": np.ones((2, 3))}, ValueError, "K microphones, J loudspeakers, taps"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )
@@ -291,10 +277,8 @@ def test_settings_that_do_not_fit_are_refused(changed: dict[str, Any], error: ty
         (control.StateSpace([[0.5]], [[1.0]], [[1.0], [1.0]], 0.0), {}, ValueError, r"dt = 1/fs, got dt = 0"),
         (control.StateSpace([[1.0]], [[1.0]], [[1.0], [1.0]], 0.0, 1 / FS), {}, ValueError, "pole of magnitude 1"),
         (control.StateSpace([[0.5]], [[1.0]], [[1.0]], 0.0, 1 / FS), {}, ValueError, "outputs for the 1 physical .* got 1"),
-        (random_model(False)[:2, :2], {"sensor_noise_std": 0.0}, ValueError, "sensor_noise_std must be greater than 0"),
         (random_model(False)[:2, :2], {"source_power": [1.0]}, ValueError, "source_power must be one .* each of the 2 sources"),
     ],
-    ids=["list", "continuous", "unstable", "outputs", "sensor noise", "sources"],
 )  # fmt: skip
 def test_models_that_do_not_fit_are_refused(model: Any, changed: dict, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
@@ -311,9 +295,3 @@ def test_a_run_at_another_rate_is_refused() -> None:
     controller = VirtualMicrophones(Recorded(np.zeros((1, 9))), paths, observer, physical=[0])
     with pytest.raises(ValueError, match="observer is for 4000 Hz"):
         simulate(controller, noise(), disturbance=np.zeros((2, 1500)), secondary_path=paths, fs=2 * FS)
-
-
-def test_a_controller_that_cannot_listen_says_so() -> None:
-    controller = VirtualMicrophones(Recorded(np.zeros((1, 9))), SECONDARY[:2, :1], [[[1.0]]], physical=[0])
-    with pytest.raises(ValueError, match="needs a controller with a method listen"):
-        controller.listen(np.zeros((1, 5)), np.zeros((2, 5)))

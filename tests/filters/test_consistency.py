@@ -168,38 +168,23 @@ WHITE = {"innovations": np.ones((30, 1)), "S": np.ones((30, 1, 1))}
     ("arguments", "error", "message"),
     [
         ({}, ValueError, "give either a Saver, or innovations= and S="),
-        ({"innovations": np.ones((30, 1))}, ValueError, "give either a Saver"),
         ({"saver": 3}, TypeError, "saver must be a filterpy.common.Saver that has saved"),
         ({"saver": Saver(KalmanFilter(1, 1)), "x": 1}, ValueError, "the Saver's own"),
+        ({"saver": [tracked(np.random.default_rng(0), n)[0] for n in (4, 5)]}, ValueError, "equally many samples"),
         ({**WHITE, "innovations": np.ones(30)}, ValueError, r"innovations must be .* got shape \(30,\)"),
         ({**WHITE, "S": np.ones((30, 1))}, ValueError, r"S must have shape \(1, 30, 1, 1\)"),
         ({**WHITE, "S": np.zeros((30, 1, 1))}, ValueError, "S must hold positive definite matrices"),
-        ({**WHITE, "S": np.full((30, 1, 1), np.nan)}, ValueError, "S must be finite"),
-        ({**WHITE, "innovations": np.full((30, 1), np.inf)}, ValueError, "innovations must be finite"),
         ({**WHITE, "innovations": np.ma.masked_all((30, 1))}, ValueError, "all innovations are masked"),
         ({**WHITE, "coverage": 1.0}, ValueError, "coverage must be above 0 and below 1, got 1"),
         ({**WHITE, "max_lag": 30}, ValueError, "more than max_lag = 30 samples, got 30; lower max_lag"),
-        ({**WHITE, "max_lag": 2.5}, TypeError, "max_lag must be a whole number"),
         ({**WHITE, "truth": np.ones((30, 1))}, ValueError, "give x= and P= beside truth="),
         ({**WHITE, "truth": np.ones(30), "x": 1, "P": 1}, ValueError, "a column for each state"),
-        ({**WHITE, "truth": np.ones((9, 1)), "x": np.ones((30, 1)), "P": WHITE["S"]}, ValueError, "truth must have"),
         ({**WHITE, "truth": np.ones((30, 1)), "x": np.ones((30, 2)), "P": WHITE["S"]}, ValueError, "x must have"),
-        (
-            {**WHITE, "truth": WHITE["innovations"], "x": WHITE["innovations"], "P": -WHITE["S"]},
-            ValueError,
-            "P must hold",
-        ),
     ],
 )
 def test_what_cannot_be_tested_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
         consistency(**arguments)
-
-
-def test_savers_of_different_lengths_are_refused():
-    short, long = (tracked(np.random.default_rng(0), n)[0] for n in (30, 31))
-    with pytest.raises(ValueError, match=r"equally many samples, got \[30, 31\]"):
-        consistency([short, long])
 
 
 def test_the_figure_shows_the_values_and_their_bounds():

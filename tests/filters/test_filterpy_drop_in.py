@@ -229,19 +229,6 @@ def saved(cls: type) -> list:
     return [getattr(saver, name) for name in names]
 
 
-def univariate(cls: type) -> list:
-    """test_univariate: integer state, scalar Q, integer measurements."""
-    kf = cls(dim_x=1, dim_z=1, dim_u=1)
-    kf.x, kf.Q = np.array([[0]]), 0.02
-    kf.H = kf.F = kf.B = np.array([[1.0]])
-    kf.P *= 50
-    kf.R *= 0.1
-    for i in range(50):
-        kf.predict()
-        kf.update(i)
-    return [kf.x, kf.P, kf.K]
-
-
 def steady_state(cls: type) -> list:
     """test_steadystate: three directions, four derivatives of each."""
     own = {"kf": cls(5, 1)} if FILTERPY_2 else {}  # 2.0.0 fills in a filter of the user's class
@@ -258,14 +245,6 @@ def steady_state(cls: type) -> list:
     kf.B = np.ones((kf.dim_x, 1))
     kf.predict_steadystate(u=np.array([[2.0]]))
     return [kf.x, kf.P, kf.y, kf.K, kf.x_prior, kf.P_prior, kf.x_post, kf.P_post]
-
-
-def defaults(cls: type) -> list:
-    """test_default_dims, in which H keeps its zeros."""
-    kf = cls(dim_x=3, dim_z=1)
-    kf.predict()
-    kf.update(np.array([[1.0]]).T)
-    return [kf.x, kf.P, kf.K]
 
 
 def custom_inverse(cls: type, inverse: Callable) -> list:
@@ -418,8 +397,6 @@ USES: dict[str, list[Callable[[type], list]]] = {
     "`predict`, `update`": [
         lambda cls: recursive_then_batch(cls, 2),
         lambda cls: recursive_then_batch(cls, 1),
-        univariate,
-        defaults,
         scalar_transition,
     ],
     "`batch_filter`": [

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -130,18 +128,14 @@ def test_supplied_values_need_no_reference() -> None:
 def test_the_rated_powers_can_be_changed_and_lifted_and_the_settings_stay() -> None:
     z, rows, x = signals()
     kf = made()
-    assert [one.memory_s for one in kf.constraint] == [MEMORY / FS] * 2
     kf.update(z[0], H=rows[0], reference=x[0])
     kf.rated_power = 3.0
     assert kf.rated_power.tolist() == [3.0, 3.0]
-    kf.rated_power = [4.0, 5.0]
-    assert kf.rated_power.tolist() == [4.0, 5.0]
     assert kf.disturbance_power[0] > 0.0  # the powers stay
-    with pytest.raises(ValueError, match="each of the 2 loudspeakers"):
-        kf.rated_power = [1.0, 2.0, 3.0]
-    with pytest.raises(ValueError, match="rated_power must be greater than 0"):
-        kf.rated_power = [1.0, 0.0]
-    assert kf.rated_power.tolist() == [4.0, 5.0]
+    for bad, message in (([1.0, 2.0, 3.0], "each of the 2 loudspeakers"), ([1.0, 0.0], "must be greater than 0")):
+        with pytest.raises(ValueError, match=message):
+            kf.rated_power = bad
+    assert kf.rated_power.tolist() == [3.0, 3.0]
     kf.rated_power = None
     assert (kf.rated_power, kf.constraint, kf.constraint_factor) == (None, None, 1.0)
     kf.rated_power = 1.0
@@ -152,11 +146,10 @@ def test_the_rated_powers_can_be_changed_and_lifted_and_the_settings_stay() -> N
     assert [one.memory_s for one in single.constraint] == [MEMORY / FS] * 2
 
 
-def test_copies_stand_alone_and_batches_are_the_steps() -> None:
+def test_batches_are_the_steps_and_the_constraints_are_the_filters_own() -> None:
     z, rows, x = signals()
-    kf = made()
-    steps = copy.deepcopy(kf)
     given = constraints()
+    kf, steps = made(constraint=given), made()
     given[0].rated_power = 99.0
     assert kf.rated_power[0] == RATED[0]
     kf.batch_filter(list(z[:30, :, np.newaxis]), Hs=list(rows[:30]), references=x[:30])
@@ -165,11 +158,6 @@ def test_copies_stand_alone_and_batches_are_the_steps() -> None:
         steps.update(z[n], H=rows[n], reference=x[n])
     np.testing.assert_array_equal(kf.x, steps.x)
     assert kf.constraint_factor == steps.constraint_factor
-    for twin in (copy.copy(kf), copy.deepcopy(kf), pickle.loads(pickle.dumps(kf))):
-        before = twin.constraint_factor
-        kf.update(z[30], H=rows[30], reference=x[30])
-        assert twin.constraint_factor == before != kf.constraint_factor
-        assert type(twin.constraint) is type(kf.constraint)
     assert "rated power 0.5, 2, fs 16000 Hz" in repr(made())
 
 

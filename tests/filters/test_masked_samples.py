@@ -68,15 +68,6 @@ def test_a_list_may_hold_masked_samples() -> None:
     require_same_run(kf, other, zs, by_hand(Z), Hs=list(ROWS))
 
 
-def test_a_masked_array_without_a_masked_sample() -> None:
-    kf, other = MAKERS["general"](), MAKERS["general"]()
-    require_same_run(kf, other, np.ma.array(Z), Z, Hs=list(ROWS))
-    kf, other = KFOPC(N, 2), KFOPC(N, 2)
-    for f in (kf, other):
-        f.H = np.eye(2, N)
-    require_same_run(kf, other, np.ma.array(Z.reshape(-1, 2)), Z.reshape(-1, 2))
-
-
 # Some components of a measurement
 
 

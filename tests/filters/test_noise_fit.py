@@ -175,28 +175,23 @@ RECORD = np.random.default_rng(0).standard_normal(40)
 
 
 @pytest.mark.parametrize(
-    ("z", "arguments", "error", "message"),
+    ("z", "arguments", "message"),
     [
-        (np.array([1.0, np.nan, 2.0, 3.0]), {}, ValueError, r"z must be finite.*np.ma.masked_invalid\(z\)"),
-        (np.ones((10, 2)), {}, ValueError, r"z must be a record \(n_samples, 1\), for the 1 row"),
-        ([1.0, [1.0, 2.0]], {}, ValueError, r"z must hold None or 1 value\(s\) for each sample"),
-        (["a", "b", "c"], {}, TypeError, "z must be a sequence of real numbers"),
-        (3.0, {}, ValueError, "z must be a record"),
-        (RECORD[:2], {}, ValueError, "z must hold more than 2 measurements for 2 noises, got 2"),
-        ([None] * 30, {}, ValueError, "got 0"),
-        (RECORD, {"Q_parts": [], "R_parts": []}, ValueError, "nothing to learn"),
-        (RECORD, {"Q_parts": [np.eye(2)]}, ValueError, r"Q_parts\[0\] must have shape \(1, 1\), got \(2, 2\)"),
-        (RECORD, {"R_parts": [[[-1.0]]]}, ValueError, r"R_parts\[0\] must be symmetric and positive semidefinite"),
-        (RECORD, {"Q_parts": [np.zeros((1, 1))]}, ValueError, r"Q_parts\[0\] must not be zero"),
-        (RECORD, {"R_parts": [[[1.0]], [[2.0]]]}, ValueError, "R_parts must not be sums of multiples"),
-        (RECORD, {"H": np.zeros((1, 1))}, ValueError, "H must not be zero"),
-        (RECORD, {"H": np.ones((39, 1, 1))}, ValueError, "one matrix for each of the 40 samples of z, got 39"),
-        (RECORD, {"H": np.ones((1, 3))}, ValueError, r"F must be \(1, 1\) and H \(dim_z, 1\)"),
-        (np.zeros(40), {}, ValueError, "the likelihood has no peak"),
+        (np.array([1.0, np.nan, 2.0, 3.0]), {}, r"z must be finite.*np.ma.masked_invalid\(z\)"),
+        (np.ones((10, 2)), {}, r"z must be a record \(n_samples, 1\), for the 1 row"),
+        ([1.0, [1.0, 2.0]], {}, r"z must hold None or 1 value\(s\) for each sample"),
+        (RECORD[:2], {}, "z must hold more than 2 measurements for 2 noises, got 2"),
+        (RECORD, {"Q_parts": [], "R_parts": []}, "nothing to learn"),
+        (RECORD, {"Q_parts": [np.eye(2)]}, r"Q_parts\[0\] must have shape \(1, 1\), got \(2, 2\)"),
+        (RECORD, {"R_parts": [[[-1.0]]]}, r"R_parts\[0\] must be symmetric and positive semidefinite"),
+        (RECORD, {"R_parts": [[[1.0]], [[2.0]]]}, "R_parts must not be sums of multiples"),
+        (RECORD, {"H": np.ones((39, 1, 1))}, "one matrix for each of the 40 samples of z, got 39"),
+        (RECORD, {"H": np.ones((1, 3))}, r"F must be \(1, 1\) and H \(dim_z, 1\)"),
+        (np.zeros(40), {}, "the likelihood has no peak"),
     ],
 )
-def test_a_record_or_a_model_that_cannot_be_used_is_refused(z, arguments, error, message):
-    with pytest.raises(error, match=message):
+def test_a_record_or_a_model_that_cannot_be_used_is_refused(z, arguments, message):
+    with pytest.raises(ValueError, match=message):
         fit_noise(local_level(), z, **arguments)
 
 

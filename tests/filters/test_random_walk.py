@@ -142,12 +142,6 @@ def control(f: KalmanFilter, rng: np.random.Generator) -> None:
     f.predict(B=rng.normal(size=(f.dim_x, 2)), u=rng.normal(size=(2, 1)))
 
 
-def own_control(f: KalmanFilter, rng: np.random.Generator) -> None:
-    f.B = rng.normal(size=(f.dim_x, 1))
-    f.predict(u=np.array([[0.3]]))
-    f.B = None
-
-
 def steady(f: KalmanFilter, rng: np.random.Generator) -> None:
     f.predict_steadystate()
     f.update_steadystate(rng.normal())
@@ -171,14 +165,12 @@ def two_rows(f: KalmanFilter, rng: np.random.Generator) -> None:
 
 ACTIONS: dict[str, Callable[[KalmanFilter, np.random.Generator], Any]] = {
     "predict": lambda f, rng: f.predict(),
-    "predict with a scalar Q": lambda f, rng: f.predict(Q=0.05),
     "missed sample": lambda f, rng: f.update(None),
     "F passed": full_F,
     "F assigned": assigned_F,
     "Q passed": full_Q,
     "Q assigned": assigned_Q,
     "u and B passed": control,
-    "B assigned": own_control,
     "steady state": steady,
     "P poked in place": poked,
     "P replaced, then scaled": replaced,
@@ -266,14 +258,6 @@ def test_an_edit_of_P_counts_however_it_is_made() -> None:
     assert S[0] == pytest.approx(10 * (1 + 1e-4) * 14 + 0.5)
 
 
-def test_a_number_assigned_to_P_is_that_variance_for_every_tap() -> None:
-    """As in filterpy's equations, test_rts' P = .01 among them."""
-    kf, ours = filters = pair(3)
-    both(filters, lambda f: setattr(f, "P", 0.01))
-    fast_step(filters, np.random.default_rng(0), 3)
-    require_close(kf, ours)
-
-
 def test_P_prior_is_P_post_and_the_gain_direction() -> None:
     rng = np.random.default_rng(1)
     for P0 in (1.0, 1e9):  # the second takes the downdate in twice the precision
@@ -289,42 +273,18 @@ def test_P_prior_is_P_post_and_the_gain_direction() -> None:
         np.testing.assert_allclose(ours.P_prior, prior, rtol=1e-14, atol=1e-14 * P0)
 
 
-WRITES: dict[str, Callable[[np.ndarray], Any]] = {
-    "item": lambda a: a.__setitem__((0, 0), 2.0),
-    "slice": lambda a: a.__setitem__(slice(None), 2.0),
-    "+=": lambda a: a.__iadd__(1.0),
-    "out=": lambda a: np.add(a, 1.0, out=a),
-    "a view of it": lambda a: a.T[0].__setitem__(0, 3.0),
-    "sort": lambda a: a.sort(),
-    "flat": lambda a: a.flat.__setitem__(0, 2.0),
-}
-
-
 @pytest.mark.parametrize("name", ["F", "Q", "R"])
-@pytest.mark.parametrize("write", WRITES)
-def test_a_write_into_F_Q_R_is_refused(name: str, write: str) -> None:
-    _, ours = pair(3)
-    with pytest.raises(ValueError, match="read-only"):
-        WRITES[write](getattr(ours, name))
-    assert np.array_equal(ours.F, np.eye(3))
-    assert np.array_equal(ours.Q, 1e-4 * np.eye(3))
-    assert np.array_equal(ours.R, [[0.5]])
-
-
-@pytest.mark.parametrize("name", ["F", "Q", "R"])
-def test_what_is_made_from_F_Q_R_is_a_plain_array(name: str) -> None:
+def test_a_write_into_F_Q_R_is_refused_and_what_is_made_from_them_is_a_plain_array(name: str) -> None:
     _, ours = pair(3)
     matrix = getattr(ours, name)
-    for made in (matrix * 2, matrix + matrix, matrix @ matrix, np.dot(matrix, matrix), matrix.copy(), np.array(matrix)):
+    before = matrix.copy()
+    for write in (lambda a: a.__setitem__((0, 0), 2.0), lambda a: np.add(a, 1.0, out=a), lambda a: a.T[0].sort()):
+        with pytest.raises(ValueError, match="read-only"):
+            write(getattr(ours, name))
+    for made in (matrix * 2, matrix @ matrix, np.dot(matrix, matrix), np.array(matrix), matrix.astype(float)):
         assert type(made) is np.ndarray
         made[0, 0] = 7.0  # can be written into
-    astype = matrix.astype(float)
-    astype[0, 0] = 7.0
-    assert getattr(ours, name)[0, 0] != 7.0
-    ours.B = np.ones((3, 1))
-    ours.predict(u=np.array([[1.0]]))  # filterpy's equations, with our F
-    for attribute in ("x", "P", "x_prior", "P_prior"):
-        assert type(getattr(ours, attribute)) is np.ndarray
+    np.testing.assert_array_equal(getattr(ours, name), before)
 
 
 def test_Q_and_R_take_numbers_and_multiples_of_the_identity() -> None:
@@ -522,19 +482,6 @@ def test_a_silent_filter_of_no_variance_is_refused() -> None:
     ours.predict()
     ours.update(1.0, H=np.ones(3))
     np.testing.assert_allclose(ours.x[:, 0], np.full(3, 1 / 3))
-
-
-@pytest.mark.parametrize("x", [[np.nan, 0.0, 0.0], [0.0, 0.0]])
-def test_weights_that_are_no_weights_are_refused_by_both_steps(x: list[float]) -> None:
-    kf = KFOPC.random_walk(3, state_noise=1e-3, measurement_noise=1.0)
-    kf.predict()
-    kf.x = np.array(x)
-    P = kf.P.copy()
-    with pytest.raises(ValueError, match="x must have 3 finite values"):
-        kf.predict()
-    with pytest.raises(ValueError, match="x must have 3 finite values"):
-        kf.update(1.0, H=np.ones(3))
-    assert np.array_equal(kf.P, P)
 
 
 def test_an_inverse_of_ones_own_is_used() -> None:

@@ -130,12 +130,6 @@ def test_without_a_limit_that_acts_the_estimate_is_returned():
     assert_allclose(constrained(kf, lower=-50.0, upper=np.full(4, np.inf), power=(np.eye(4), 1e4)), kf.x, atol=1e-14)
 
 
-def test_a_diagonal_covariance_clips_at_the_box_in_any_units():
-    kf = made(3, 0)
-    kf.x, kf.P = np.array([3e6, -2e-9, 1.0]), np.diag([1e10, 1e-20, 1.0])
-    assert_allclose(constrained(kf, lower=[0, -1e-9, -1], upper=[1e6, 1, 1]), [1e6, -1e-9, 1.0], rtol=1e-12)
-
-
 @pytest.mark.parametrize("size", [1e-30, 1e-20, 1e-10, 1e10, 1e20])
 def test_the_size_of_the_covariance_does_not_matter(size):
     """Limits are then up to 1e15 deviations away; the state is the same to the rounding of the two solutions."""
@@ -196,24 +190,13 @@ def test_the_price_of_KF_PB_is_this_limit_with_the_autocorrelation_matrix():
     [
         ({"upper": -1.0, "lower": 1.0}, ValueError, r"lower\[0\] = 1 must not be above upper\[0\] = -1"),
         ({"upper": [1.0, 2.0]}, ValueError, r"upper must be one number or \(3,\), inf for a state without one"),
-        ({"upper": np.nan}, ValueError, "upper must be"),
-        ({"lower": np.inf}, ValueError, "lower must be one number"),
         ({"equalities": np.eye(3)}, TypeError, r"equalities must be a pair of a matrix \(m, 3\)"),
         ({"equalities": (np.eye(3), 1.0)}, ValueError, "one row and one value for each limit"),
-        ({"inequalities": (np.eye(2), np.ones(2))}, ValueError, r"a matrix \(m, 3\) and values"),
         ({"inequalities": ([1.0, np.nan, 0.0], 1.0)}, ValueError, r"inequalities\[0\] must be finite"),
-        ({"inequalities": (["a", "b", "c"], 1.0)}, TypeError, r"inequalities\[0\] must be a sequence of real"),
-        ({"power": np.eye(3)}, TypeError, "power must be a pair"),
         ({"power": (np.eye(2), 1.0)}, ValueError, r"power\[0\] must have shape \(3, 3\), got \(2, 2\)"),
         ({"power": (np.eye(3), 0.0)}, ValueError, r"power\[1\] must be greater than 0"),
-        (
-            {"power": (-np.eye(3), 1.0)},
-            ValueError,
-            r"power\[0\] must be symmetric and positive semidefinite.*negative variances",
-        ),
-        ({"power": (np.triu(np.ones((3, 3))), 1.0)}, ValueError, "must be symmetric"),
+        ({"power": (-np.eye(3), 1.0)}, ValueError, "symmetric and positive semidefinite.*negative variances"),
         ({"inequalities": ([[1, 0, 0], [-1, 0, 0]], [-1.0, -1.0])}, ValueError, "contradict"),
-        ({"equalities": ([[1, 0, 0], [2, 0, 0]], [1.0, 1.0])}, ValueError, "contradict"),
         ({"equalities": ([1, 0, 0], 1.0), "upper": 0.5}, ValueError, "contradict"),
         ({"lower": 1.0, "power": (np.eye(3), 2.0)}, ValueError, r"x' M x <= 2 keeps the other limits: raise rho"),
     ],
@@ -232,9 +215,7 @@ def test_limits_that_cannot_be_kept_or_read_are_refused_and_change_nothing(limit
     [
         (np.zeros((1, 2)), np.eye(2), r"kf.x must have shape \(n,\) or \(n, 1\), got \(1, 2\)"),
         (np.zeros(3), np.eye(2), r"kf.P must have shape \(3, 3\), got \(2, 2\)"),
-        (np.zeros(2), -np.eye(2), "negative variances"),
         (np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]]), "positive semidefinite"),
-        (np.full(2, np.nan), np.eye(2), "x must be finite"),
         (np.zeros(2), np.full((2, 2), np.inf), "P must be finite"),
     ],
 )
