@@ -275,6 +275,8 @@ def faults_of_updates() -> dict[str, Fault]:
             for what, value in list(cases.items())[: None if method == "update" else 1]:
                 match = "z must be real, got complex" if "complex" in what else rf"\b{name}\b|{name}_"
                 add(method, f"{name} {what}", match, **{name + suffix * (name in "HR"): value})
+        if method != "update":  # which takes it as missing
+            add(method, "z masked", "z must not be masked, except in update", z=np.ma.masked)
     add("update", "two rows for one measurement", "z", z=[1.0, 2.0, 3.0], H=np.ones((2, TAPS)))
     return found
 
@@ -289,6 +291,10 @@ def faults_of_other_steps() -> dict[str, Fault]:
         "predict: F NaN": (lambda f: f.predict(F=NAN * np.eye(TAPS)), "F"),
         "predict: F of another size": (lambda f: f.predict(F=np.eye(TAPS + 1)), "F"),
         "predict: F as a ragged list": (lambda f: f.predict(F=[[1.0], [1.0, 0.0]]), "F must be .*differ in length"),
+        "predict: F complex": (lambda f: f.predict(F=1j), "F"),
+        "predict: Q beyond a float": (lambda f: f.predict(Q=10**400), "Q"),
+        "H assigned as text": (lambda f: setattr(f, "H", [["a"]]), "H must be a sequence of real numbers"),
+        "residual_of: z masked": (lambda f: f.residual_of(np.ma.array([7.0], mask=[True])), "z must not be masked"),
         "predict: Q negative": (lambda f: f.predict(Q=-1.0), "Q"),
         "predict: Q of another size": (lambda f: f.predict(Q=np.eye(2)), "Q"),
         "predict: Q with a negative variance": (lambda f: f.predict(Q=np.diag([1.0, 1, -1, 1, 1])), "Q"),

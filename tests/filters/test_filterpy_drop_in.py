@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filterpy.common import Q_discrete_white_noise, Saver, inv_diagonal, kinematic_kf
+from filterpy.common import Q_discrete_white_noise, Saver, inv_diagonal
 from filterpy.kalman import FixedLagSmoother, IMMEstimator, MMAEFilterBank
 from filterpy.kalman import KalmanFilter as FilterpyKalmanFilter
 from filterpy.kalman import kalman_filter as functions
@@ -138,7 +138,8 @@ def test_thousands_of_steps_of_any_kind(n: int, m: int, k: int, x_ndim: int) -> 
         assert np.array_equal(kf.P, ours.P), step
         if step % 25 == 0:
             require_same(kf, ours)
-            z = rng.normal(size=kf.y.shape)
+            z, u = rng.normal(size=kf.y.shape), rng.normal(size=(k, 1)[:x_ndim]) if k else None
+            assert same(kf.get_prediction(u), ours.get_prediction(u))
             assert same(kf.get_update(z), ours.get_update(z))
             assert same(kf.residual_of(z), ours.residual_of(z))
             assert same(kf.log_likelihood_of(z), ours.log_likelihood_of(z))
@@ -229,24 +230,6 @@ def saved(cls: type) -> list:
     return [getattr(saver, name) for name in names]
 
 
-def steady_state(cls: type) -> list:
-    """test_steadystate: three directions, four derivatives of each."""
-    own = {"kf": cls(5, 1)} if FILTERPY_2 else {}  # 2.0.0 fills in a filter of the user's class
-    model = kinematic_kf(dim=1, order=4, **own)
-    kf = cls(15, 3)
-    kf.F, kf.H = np.kron(np.eye(3), model.F), np.kron(np.eye(3), model.H)
-    kf.x[1] = 1.0
-    for i in range(50):
-        kf.predict()
-        kf.update([i] * 3)
-    for i in range(50):
-        kf.predict_steadystate()
-        kf.update_steadystate([i] * 3)
-    kf.B = np.ones((kf.dim_x, 1))
-    kf.predict_steadystate(u=np.array([[2.0]]))
-    return [kf.x, kf.P, kf.y, kf.K, kf.x_prior, kf.P_prior, kf.x_post, kf.P_post]
-
-
 def custom_inverse(cls: type, inverse: Callable) -> list:
     kf = constant_velocity(cls)
     kf.inv = inverse
@@ -312,18 +295,6 @@ def multiple_models(cls: type) -> list:
     return seen
 
 
-def predictions(cls: type) -> list:
-    kf = constant_velocity(cls)
-    kf.B = np.array([[0.5], [1.0]])
-    kf.predict()
-    kf.update(3.0)
-    u = np.array([[1.0]])
-    seen = [kf.get_prediction(u)]
-    if FILTERPY_2:  # 1.4.5 takes u alone
-        seen += [kf.get_prediction(), kf.get_prediction(u, F=np.eye(2), Q=0.2)]
-    return [*seen, kf.get_update(4.0), kf.get_update(), kf.x, kf.P, kf.y]
-
-
 def fixed_lag(cls: type) -> list:
     """test_fls: the smoother has the filter's matrices, and smooths the same measurements."""
     kf, smoother = constant_velocity(cls), FixedLagSmoother(dim_x=2, dim_z=1, N=5)
@@ -335,35 +306,6 @@ def fixed_lag(cls: type) -> list:
         smoother.smooth(z)
     assert len(smoother.xSmooth) == 30
     return [kf.x, smoother.x, *smoother.xSmooth, *smoother.smooth_batch(noisy_line(30), N=5)]
-
-
-def corrected(cls: type, correct: Callable) -> list:
-    """Two positions, with correlated noises, by a way to correct."""
-    kf = constant_velocity(cls, dim=2)
-    kf.M = np.full((4, 2), 0.1)
-    for z in noisy_line(30):
-        kf.predict()
-        correct(kf, np.array([[z], [-z]]))
-    return [kf.x, kf.P, kf.K, kf.y, kf.z, kf.x_post, kf.P_post]
-
-
-def in_sequence(kf: KalmanFilter, z: np.ndarray) -> None:
-    if not FILTERPY_2:
-        pytest.skip("filterpy 1.4.5 has no update_sequential")
-    kf.update_sequential(0, z[0].item())
-    kf.update_sequential(1, z[1].item())
-
-
-def read_between_steps(cls: type) -> list:
-    kf, seen = constant_velocity(cls), []
-    for z in noisy_line(10):
-        kf.predict()
-        kf.update(z)
-        seen += [kf.residual_of(z + 1), kf.log_likelihood_of(z + 1), kf.measurement_of_state(kf.x)]
-        seen += [kf.log_likelihood, kf.likelihood, kf.mahalanobis]
-    kf.predict()
-    kf.update(None)
-    return [*seen, kf.log_likelihood, kf.likelihood]
 
 
 def procedural(cls: type) -> list:
@@ -384,22 +326,19 @@ def fading(cls: type) -> list:
     return [list(kf.batch_filter(noisy_line(30))), kf.alpha]
 
 
-def scalar_transition(cls: type) -> list:
-    kf = cls(2, 1)
-    kf.F, kf.H = np.float64(0.9), np.array([[1.0, 0.5]])
-    kf.predict()
-    kf.update(1.0)
-    return [kf.x, kf.P]
-
-
-# The rows of the page's last table, and their scenarios.
+# The rows of the page's last table, and their scenarios beside `test_thousands_of_steps_of_any_kind`.
+STEPS = [
+    "`predict`, `update`",
+    "`predict_steadystate`, `update_steadystate`",
+    "`update_correlated`",
+    "`update_sequential`",
+    "`get_prediction`, `get_update`",
+    "`residual_of`, `log_likelihood_of`, `measurement_of_state`",
+]
 USES: dict[str, list[Callable[[type], list]]] = {
-    "`predict`, `update`": [
+    "`batch_filter`": [
         lambda cls: recursive_then_batch(cls, 2),
         lambda cls: recursive_then_batch(cls, 1),
-        scalar_transition,
-    ],
-    "`batch_filter`": [
         batch,
         lambda cls: batch(cls, update_first=True),
         lambda cls: batch_of_lists(cls, False),
@@ -410,11 +349,6 @@ USES: dict[str, list[Callable[[type], list]]] = {
     "`Saver`": [saved],
     "`IMMEstimator`": [interacting_models],
     "`MMAEFilterBank`": [multiple_models],
-    "`predict_steadystate`, `update_steadystate`": [steady_state],
-    "`update_correlated`": [lambda cls: corrected(cls, lambda kf, z: kf.update_correlated(z))],
-    "`update_sequential`": [lambda cls: corrected(cls, in_sequence)],
-    "`get_prediction`, `get_update`": [predictions],
-    "`residual_of`, `log_likelihood_of`, `measurement_of_state`": [read_between_steps],
     "`predict`, `update`, `batch_filter`, `rts_smoother` as functions": [procedural],
     "`copy`, `deepcopy`, `pickle`": [
         lambda cls: copied_mid_run(cls, copy.copy),
@@ -440,7 +374,7 @@ def test_a_filterpy_use_gives_the_same_bits(scenario: Callable[[type], list]) ->
 
 def test_the_page_lists_these_uses() -> None:
     page = (ROOT / "docs" / "filterpy.md").read_text(encoding="utf-8")
-    assert [row[0] for row in table_of(page, "Parts of filterpy that were compared")] == list(USES)
+    assert {row[0] for row in table_of(page, "Parts of filterpy that were compared")} == {*STEPS, *USES}
 
 
 def test_the_imm_of_the_fork_runs_KFOPCs() -> None:
