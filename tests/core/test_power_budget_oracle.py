@@ -164,15 +164,8 @@ def test_a_primary_path_that_flips_its_polarity(spread: float) -> None:
     assert spread == 0.0 or oracle.plant.wrong >= 4  # the data were forgotten, in both
 
 
-@pytest.mark.parametrize("spread", [0.0, 0.3])
-def test_several_channels(spread: float) -> None:
-    s, x, d, _ = scene(3, 2, 2, 2, 5.0)
-    oracle, core = pair(s, 12, 2, np.array([0.25, 0.1]) * np.mean(d**2), spread, 2.0)
-    compare(oracle, core, x, d, lambda n: s)
-
-
-@pytest.mark.parametrize(("K", "J", "references"), [(3, 2, 1), (9, 1, 1), (1, 3, 1), (2, 1, 3)])
-def test_unequal_counts(K: int, J: int, references: int) -> None:
+@pytest.mark.parametrize(("K", "J", "references"), [(2, 2, 2), (3, 2, 1), (9, 1, 1), (1, 3, 1), (2, 1, 3)])
+def test_several_channels(K: int, J: int, references: int) -> None:
     """Nine microphones are more than a solution takes at once."""
     s, x, d, _ = scene(4, K, J, references, 3.0)
     oracle, core = pair(s, 9, references, np.linspace(0.25, 0.1, J) * np.mean(d**2), 0.3, 2.0)
@@ -217,25 +210,6 @@ def test_a_limiter() -> None:
     compare(oracle, core, x, d, lambda n: s)
     played = np.mean(core.block.fields["history"][..., -1, :] ** 2)
     assert played < 0.9 * rated * np.mean(oracle.book[:10])
-
-
-def test_opened_again_it_goes_on_to_the_bit() -> None:
-    s, x, d, _ = scene(7, 1, 1, 1, 2.0)
-    _, core = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), 0.3, 2.0)
-    other = None
-    for n in range(x.shape[1]):
-        if n == 2000:
-            other = Core.__new__(Core)
-            other.block = Block(core.block.algorithm, core.block.shape, memory=core.block.memory)
-            for name in other.block.scratch:
-                other.block.fields[name][:] = np.nan
-        for one in (core, other):
-            if one is not None:
-                y = one.control_signal(x[:, n])
-                one.update(d[:, n] - y)
-    assert np.any(y)
-    for name in core.block.states:
-        assert other.block.fields[name].tobytes() == core.block.fields[name].tobytes(), name
 
 
 def test_a_silent_reference_or_loudspeaker_leaves_the_others_at_work() -> None:

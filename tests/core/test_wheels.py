@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import struct
+import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,19 +14,17 @@ from helpers.core import FOLDER, highest_level, program, ran, tool, zig
 from kfopc_filterpy.core import building
 
 pytestmark = pytest.mark.slow
-ELF, MACH_O, PE = b"\x7fELF", b"\xcf\xfa\xed\xfe", b"MZ"
-X86, ARM = {"elf": 62, "mach-o": 0x01000007, "pe": 0x8664}, {"elf": 183, "mach-o": 0x0100000C}
-# Of each wheel, by its tag: the target in zig's words, the file format, the processor in its header.
+# Of each wheel, by its tag: the target in zig's words, and what the program `file` calls its libraries.
 WHEELS = {
-    "manylinux_2_17_x86_64": ("x86_64-linux-gnu.2.17", ELF, X86["elf"]),
-    "manylinux_2_17_aarch64": ("aarch64-linux-gnu.2.17", ELF, ARM["elf"]),
-    "musllinux_1_1_x86_64": ("x86_64-linux-musl", ELF, X86["elf"]),
-    "musllinux_1_1_aarch64": ("aarch64-linux-musl", ELF, ARM["elf"]),
-    "macosx_11_0_x86_64": ("x86_64-macos.11.0", MACH_O, X86["mach-o"]),
-    "macosx_11_0_arm64": ("aarch64-macos.11.0", MACH_O, ARM["mach-o"]),
-    "win_amd64": ("x86_64-windows-gnu", PE, X86["pe"]),
+    "manylinux_2_17_x86_64": ("x86_64-linux-gnu.2.17", "ELF 64-bit .*x86-64"),
+    "manylinux_2_17_aarch64": ("aarch64-linux-gnu.2.17", "ELF 64-bit .*ARM aarch64"),
+    "musllinux_1_1_x86_64": ("x86_64-linux-musl", "ELF 64-bit .*x86-64"),
+    "musllinux_1_1_aarch64": ("aarch64-linux-musl", "ELF 64-bit .*ARM aarch64"),
+    "macosx_11_0_x86_64": ("x86_64-macos.11.0", "Mach-O 64-bit .*x86_64"),
+    "macosx_11_0_arm64": ("aarch64-macos.11.0", "Mach-O 64-bit .*arm64"),
+    "win_amd64": ("x86_64-windows-gnu", r"PE32\+ .*\(DLL\).*x86-64"),
 }
-CODE_SIGNATURE = 0x1D  # a load command; an arm64 Mac loads nothing without it
+CODE_SIGNATURE = b"\xfa\xde\x0c\xc0"  # an arm64 Mac loads nothing without it
 
 
 def libraries(tag: str, folder: Path) -> dict[str, Path]:
@@ -40,28 +38,9 @@ def libraries(tag: str, folder: Path) -> dict[str, Path]:
         return {Path(name).name: Path(file.extract(name, folder)) for name in names}
 
 
-def machine_of(content: bytes) -> int:
-    """Return the processor that the header of a library states."""
-    if content.startswith(ELF):
-        return struct.unpack_from("<H", content, 18)[0]
-    if content.startswith(MACH_O):
-        return struct.unpack_from("<I", content, 4)[0]
-    return struct.unpack_from("<H", content, struct.unpack_from("<I", content, 60)[0] + 4)[0]
-
-
-def load_commands(content: bytes) -> list[int]:
-    """Return the kinds of the load commands of a library for macOS."""
-    (count,), at, kinds = struct.unpack_from("<I", content, 16), 32, []
-    for _ in range(count):
-        kind, size = struct.unpack_from("<II", content, at)
-        kinds.append(kind)
-        at += size
-    return kinds
-
-
 @pytest.mark.parametrize("tag", WHEELS)
 def test_libraries_of_a_wheel(tag: str, tmp_path: Path) -> None:
-    target, form, machine = WHEELS[tag]
+    target, kind = WHEELS[tag]
     found = libraries(tag, tmp_path)
     expected = {
         building.library_name(real, level, target) for real in building.REALS for level in building.levels(target)
@@ -69,12 +48,11 @@ def test_libraries_of_a_wheel(tag: str, tmp_path: Path) -> None:
     assert set(found) == expected
     for path in found.values():
         content = path.read_bytes()
-        assert content.startswith(form)
-        assert machine_of(content) == machine
+        assert re.search(kind, ran(tool("file", "file"), path))
         assert building.stamp().encode() in content
         assert b".building-" not in content  # no path of the machine that made it
         if tag.endswith("arm64"):
-            assert CODE_SIGNATURE in load_commands(content)
+            assert CODE_SIGNATURE in content
 
 
 def runner(tag: str, folder: Path) -> tuple[str, Callable[[Path, Path], str]]:

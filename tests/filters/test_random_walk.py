@@ -67,42 +67,30 @@ def both(filters: tuple[KalmanFilter, KFOPC], action: Callable[[Any], Any]) -> N
     [
         (1, "unrelated", 1e3, 1.0, 2),
         (6, "unrelated", 1e3, 1.0, 1),
-        (9, "line", 1e3, 1.0, 2),
         (16, "low-passed line", 1.0, 1.0, 2),
         (7, "line", 10.0, 1.001, 2),
         (66, "line", 1e3, 1.0, 2),
     ],
 )
 def test_ten_thousand_steps_as_filterpy(n: int, kind: str, P0: float, alpha: float, x_ndim: int) -> None:
-    """Read at random moments, so that what is made when read is made in every state."""
+    """With noises that change; read at random moments, so that what is made when read is made in every state."""
     steps, rng = 10_000, np.random.default_rng(n)
     rows = rows_of(kind, n, steps, rng)
     kf, ours = filters = pair(n, r=1e-3, q=1.0, P0=P0, x_ndim=x_ndim)
     both(filters, lambda f: setattr(f, "alpha", alpha))
     d = rows @ rng.normal(size=n) + rng.normal(size=steps)
     for k in range(steps):
-        if k % 50 == 20:  # r(n) and q(n) change with time, by assignment or as arguments
+        if k % 50 == 20:
             r, q = 10.0 ** rng.uniform(-5, -2), rng.uniform(0.5, 2.0)
             kf.Q, kf.R = r * np.eye(n), np.array([[q]])
-            if k % 100 == 20:
-                ours.state_noise, ours.measurement_noise = r, q
-            else:
-                ours.Q, ours.R = r, q
-        for _ in range(1 + (rng.random() < 0.05)):  # at times twice
-            Q = 0.002 if rng.random() < 0.05 else None
-            both(filters, lambda f, Q=Q: f.predict(Q=Q))
-            if rng.random() < 0.01:
-                require_close(kf, ours)
-        for _ in range(1 + (rng.random() < 0.05)):
-            R = 0.7 if rng.random() < 0.05 else None
-            z = None if rng.random() < 0.03 else d[k]
-            kf.update(z if z is None else np.full((1, 1)[:x_ndim], z), R=R, H=rows[k].reshape(1, n))
-            ours.update(z, R=R, H=rows[k])
-            if rng.random() < 0.01:
-                require_close(kf, ours)
+            ours.state_noise, ours.measurement_noise = r, q
+        Q, R = (number if rng.random() < 0.05 else None for number in (0.002, 0.7))
+        both(filters, lambda f, Q=Q: f.predict(Q=Q))
+        if rng.random() < 0.01:
+            require_close(kf, ours)
+        z = None if rng.random() < 0.03 else np.full((1, 1)[:x_ndim], d[k])
+        both(filters, lambda f, z=z, R=R, k=k: f.update(z, R=R, H=rows[k : k + 1]))
         if k % 997 == 500:
-            both(filters, lambda f: setattr(f, "P", 2 * f.P))
-        if k % 997 == 700:
             both(filters, lambda f: f.P.__imul__(3.0))
     require_close(kf, ours)
 
@@ -113,21 +101,12 @@ def test_ten_thousand_steps_as_filterpy(n: int, kind: str, P0: float, alpha: flo
 # Each is done to both filters with random numbers that start alike.
 
 
-def full_F(f: KalmanFilter, rng: np.random.Generator) -> None:
-    f.predict(F=0.9 * np.eye(f.dim_x) + 0.05 * rng.normal(size=(f.dim_x, f.dim_x)))
-
-
 def assigned_F(f: KalmanFilter, rng: np.random.Generator) -> None:
     f.F = 0.9 * np.eye(f.dim_x) + 0.05 * rng.normal(size=(f.dim_x, f.dim_x))
     f.F[0, -1] = 0.02
     f.predict()
     f.update(0.3, R=0.4)
     f.F = np.eye(f.dim_x)
-
-
-def full_Q(f: KalmanFilter, rng: np.random.Generator) -> None:
-    root = 0.1 * rng.normal(size=(f.dim_x, f.dim_x))
-    f.predict(Q=root @ root.T)
 
 
 def assigned_Q(f: KalmanFilter, rng: np.random.Generator) -> None:
@@ -147,12 +126,6 @@ def steady(f: KalmanFilter, rng: np.random.Generator) -> None:
     f.update_steadystate(rng.normal())
 
 
-def poked(f: KalmanFilter, rng: np.random.Generator) -> None:
-    i = int(rng.integers(f.dim_x))
-    f.P[i, i] += 0.7
-    f.x[i] += 0.2
-
-
 def replaced(f: KalmanFilter, rng: np.random.Generator) -> None:
     root = rng.normal(size=(f.dim_x, f.dim_x))
     f.P = root @ root.T + np.eye(f.dim_x)
@@ -166,13 +139,10 @@ def two_rows(f: KalmanFilter, rng: np.random.Generator) -> None:
 ACTIONS: dict[str, Callable[[KalmanFilter, np.random.Generator], Any]] = {
     "predict": lambda f, rng: f.predict(),
     "missed sample": lambda f, rng: f.update(None),
-    "F passed": full_F,
     "F assigned": assigned_F,
-    "Q passed": full_Q,
     "Q assigned": assigned_Q,
     "u and B passed": control,
     "steady state": steady,
-    "P poked in place": poked,
     "P replaced, then scaled": replaced,
     "fading": lambda f, rng: setattr(f, "alpha", 1.01),
     "update_correlated": lambda f, rng: f.update_correlated(rng.normal()),
@@ -328,12 +298,13 @@ def test_batch_filter_stays_fast_and_saves() -> None:
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("cause", ["NaN", "silent", "square overflows", "S overflows", "no covariance"])
+@pytest.mark.parametrize("cause", ["NaN", "silent", "square overflows", "S overflows", "x overflows", "no covariance"])
 @pytest.mark.parametrize("moment", ["predicted", "updated", "updated twice"])
 def test_a_refused_update_leaves_every_P(cause: str, moment: str) -> None:
     """P, P_prior and P_post, whatever is owed to the triangle at that moment; to rounding, since it may be paid."""
-    ours, rng = KFOPC.random_walk(4, state_noise=0.01, measurement_noise=0.5, rated_power=0.5), np.random.default_rng(0)
-    ours.secondary_path_gain = 1.0
+    ours, rng = KFOPC.random_walk(4, state_noise=0.01, measurement_noise=0.5), np.random.default_rng(0)
+    if cause != "x overflows":  # the square of z would, too
+        ours.rated_power, ours.secondary_path_gain = 0.5, 1.0
     for _ in range(3):
         ours.predict()
         ours.update(1.0, H=rng.normal(size=4))
@@ -346,6 +317,7 @@ def test_a_refused_update_leaves_every_P(cause: str, moment: str) -> None:
         "silent": (1.0, np.zeros(4), 0.0),
         "square overflows": (1e200, np.ones(4), None),
         "S overflows": (1.0, np.r_[1.0, np.full(3, 1e160)], None),
+        "x overflows": (1e200, np.full(4, 1e-160), 1e-310),
         "no covariance": (1.0, np.full(4, 1e-170), 0.0),
     }[cause]
     names = ("P", "P_prior", "P_post", "K", "S", "x", "x_prior", "y")
