@@ -157,17 +157,6 @@ def test_a_path_whose_polarity_flips_raises_an_alarm_and_is_learnt_again() -> No
     assert noise_reduction_db(result.error[last], result.disturbance[last], steady=1.0) > 3.0
 
 
-@pytest.mark.parametrize("uncertainty", [0.3, None])
-def test_a_primary_path_that_flips_is_learnt_again(uncertainty: float | None) -> None:
-    """Three seconds later, to 1 dB of what it was; by forgetting alone it would take the memory, of several seconds."""
-    controller, x = made(rated_power=1.0, secondary_path_uncertainty=uncertainty), noise(6.0)
-    before, after = run(controller, x), run(controller, noise(6.0, 1), primary_path=-PRIMARY)
-    last = slice(-round(3 * FS), None)
-    reductions = [noise_reduction_db(r.error[last], r.disturbance[last], steady=1.0) for r in (before, after)]
-    assert controller.alarms == 1
-    assert reductions[1] > reductions[0] - 1.0
-
-
 def test_the_account_has_a_hard_end() -> None:
     """A noise with new frequencies, thirty times as loud, meets a filter that was made for low ones."""
     low = lfilter(*butter(4, 0.1), noise(12.0, 3))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -188,21 +187,18 @@ def test_what_cannot_be_tested_is_refused(arguments, error, message):
 
 
 def test_the_figure_shows_the_values_and_their_bounds():
-    with mpl.rc_context({"backend": "agg"}):
-        saver, truth = tracked(np.random.default_rng(4), 60)
-        result = consistency(saver, truth=truth, max_lag=7)
-        axes = plot_consistency(result)
-        assert [ax.get_ylabel() for ax in axes] == ["NIS", "NEES", "Correlation"]
-        for ax, values, bounds in zip(axes, (result.nis, result.nees), (result.nis_bounds, None), strict=False):
-            drawn = [line.get_ydata() for line in ax.get_lines()]
-            assert np.array_equal(drawn[0], values)
-            limits = result.nees_bounds[:, None] + np.zeros(60) if bounds is None else bounds
-            assert np.array_equal(drawn[1:], limits)
-        assert [bar.get_height() for bar in axes[2].patches] == list(result.autocorrelation)
-        assert np.array_equal(axes[2].get_lines()[1].get_ydata(), -result.autocorrelation_bounds)
-        with pytest.raises(ValueError, match="ax must be 3 axes"):
-            plot_consistency(result, ax=axes[:2])
-        assert plot_consistency(consistency(saver, max_lag=7), ax=axes[:2])[0] is axes[0]
-        with pytest.raises(TypeError, match="result must be what consistency"):
-            plot_consistency(saver)
-        plt.close("all")
+    saver, truth = tracked(np.random.default_rng(4), 60)
+    result = consistency(saver, truth=truth, max_lag=7)
+    nis, nees, correlation = axes = plot_consistency(result)
+    assert [ax.get_ylabel() for ax in axes] == ["NIS", "NEES", "Correlation"]
+    assert np.array_equal([line.get_ydata() for line in nis.get_lines()], [result.nis, *result.nis_bounds])
+    low, high = (np.full(60, bound) for bound in result.nees_bounds)
+    assert np.array_equal([line.get_ydata() for line in nees.get_lines()], [result.nees, low, high])
+    assert [bar.get_height() for bar in correlation.patches] == list(result.autocorrelation)
+    assert np.array_equal(correlation.get_lines()[1].get_ydata(), -result.autocorrelation_bounds)
+    with pytest.raises(ValueError, match="ax must be 3 axes"):
+        plot_consistency(result, ax=axes[:2])
+    assert plot_consistency(consistency(saver, max_lag=7), ax=axes[:2])[0] is nis
+    with pytest.raises(TypeError, match="result must be what consistency"):
+        plot_consistency(saver)
+    plt.close("all")

@@ -123,23 +123,6 @@ def test_every_update_scales_its_measurement(method: str, dim_z: int, factor: fl
 
 
 @both_kinds
-@pytest.mark.parametrize("z", [4, 4.0, [4.0], (4,), np.array(4.0), np.array([4.0]), np.array([[4.0]])])
-@pytest.mark.parametrize("H", [None, np.arange(1.0, 1 + TAPS), np.arange(1.0, 1 + TAPS).reshape(1, TAPS)])
-@pytest.mark.parametrize("x_ndim", [1, 2])
-def test_forms_of_z_and_H(kind: str, z: Any, H: Any, x_ndim: int) -> None:
-    kf = make(kind)
-    kf.H, kf.x = np.arange(1.0, 1 + TAPS).reshape(1, TAPS), np.ones((TAPS, 1)[:x_ndim])
-    kf.constraint_factor = 0.25
-    kf.predict()
-    kf.update(z, H=H)
-    assert np.asarray(kf.z).item() == 4.0
-    assert kf.y.item() == 0.25 * 4.0 - 15.0
-    assert kf.x.shape == (TAPS, 1)[:x_ndim]
-    if H is not None:
-        assert H.shape in ((TAPS,), (1, TAPS)), "the caller's array is left alone"
-
-
-@both_kinds
 def test_batch_filter_scales_and_takes_references(kind: str) -> None:
     x, rows, d = scene(60)
     batch, steps = make(kind, 0.5), make(kind, 0.5)
@@ -190,25 +173,6 @@ def test_what_leaves_the_state_leaves_the_powers(kind: str) -> None:
         assert kf.z.tolist() == [[None]]
         assert kf.y.tolist() == [[0.0]]
     assert_same(kf, before, POWERS)
-
-
-@both_kinds
-def test_a_missed_sample_is_a_prediction_only(kind: str) -> None:
-    kf, other = make(kind, 0.5, secondary_path_gain=1.0), make(kind, 0.5, secondary_path_gain=1.0)
-    row = np.ones(TAPS)
-    for f in (kf, other):
-        f.predict()
-        f.update(3.0, H=row)
-        f.predict()
-    kf.update(None, R=-1.0, H="unused", reference=NAN)
-    assert np.array_equal(kf.x_post, kf.x)
-    assert np.array_equal(kf.P_post, kf.P)
-    for f in (kf, other):
-        f.predict()
-        f.update(1.0, H=row)
-    np.testing.assert_array_equal(kf.x, other.x)
-    np.testing.assert_array_equal(kf.P, other.P)
-    assert_same(kf, other, POWERS)
 
 
 def test_without_a_rated_power() -> None:

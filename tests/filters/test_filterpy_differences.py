@@ -112,11 +112,6 @@ def test_what_may_surprise_is_as_in_filterpy(code: str) -> None:
     assert exactly(*each) == exactly(*own)
 
 
-def test_a_number_assigned_to_R_fills_every_element() -> None:
-    kf = run(KFOPC, "kf.R = 5.0; kf.update([1.0, 2.0])")[0]
-    np.testing.assert_array_equal(kf.S - 2 * np.eye(2), np.full((2, 2), 5.0))  # H P H' = 2 I
-
-
 def test_a_batch_names_the_step_that_was_refused_and_saves_those_before() -> None:
     class Counted:
         saved = 0

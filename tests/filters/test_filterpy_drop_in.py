@@ -6,8 +6,6 @@ own tests (test_kf, test_rts, test_imm, test_mmae) put its filter through, and m
 
 from __future__ import annotations
 
-import copy
-import pickle
 from collections.abc import Callable
 from math import sqrt
 from typing import Any
@@ -242,19 +240,6 @@ def custom_inverse(cls: type, inverse: Callable) -> list:
     return [kf.x, kf.P, kf.SI]
 
 
-def copied_mid_run(cls: type, clone: Callable) -> list:
-    kf = constant_velocity(cls)
-    for z in noisy_line(10):
-        kf.predict()
-        kf.update(z)
-    other = clone(kf)
-    kf.update(1e6)  # the copy does not see it
-    for z in noisy_line(10):
-        other.predict()
-        other.update(z)
-    return [kf.x, other.x, other.P, other.K]
-
-
 def pairs_of_models(cls: type) -> list[KalmanFilter]:
     """The banks of test_imm and test_mmae: constant acceleration, with much noise and with little."""
     filters = []
@@ -320,20 +305,15 @@ def procedural(cls: type) -> list:
     return [x, P, means, covariances, *functions.rts_smoother(means, covariances, [kf.F] * n, [kf.Q] * n)]
 
 
-def fading(cls: type) -> list:
-    kf = constant_velocity(cls)
-    kf.alpha = 1.02
-    return [list(kf.batch_filter(noisy_line(30))), kf.alpha]
-
-
-# The rows of the page's last table, and their scenarios beside `test_thousands_of_steps_of_any_kind`.
-STEPS = [
+# The rows of the page's last table: those of `test_thousands_of_steps_of_any_kind` and of test_saved_filters.py, and scenarios.
+ELSEWHERE = [
     "`predict`, `update`",
     "`predict_steadystate`, `update_steadystate`",
     "`update_correlated`",
     "`update_sequential`",
     "`get_prediction`, `get_update`",
     "`residual_of`, `log_likelihood_of`, `measurement_of_state`",
+    "`copy`, `deepcopy`, `pickle`",
 ]
 USES: dict[str, list[Callable[[type], list]]] = {
     "`batch_filter`": [
@@ -350,15 +330,9 @@ USES: dict[str, list[Callable[[type], list]]] = {
     "`IMMEstimator`": [interacting_models],
     "`MMAEFilterBank`": [multiple_models],
     "`predict`, `update`, `batch_filter`, `rts_smoother` as functions": [procedural],
-    "`copy`, `deepcopy`, `pickle`": [
-        lambda cls: copied_mid_run(cls, copy.copy),
-        lambda cls: copied_mid_run(cls, copy.deepcopy),
-        lambda cls: copied_mid_run(cls, lambda kf: pickle.loads(pickle.dumps(kf))),
-    ],
     "`inv`, `alpha`": [
         lambda cls: custom_inverse(cls, np.linalg.pinv),
         lambda cls: custom_inverse(cls, inv_diagonal),
-        fading,
     ],
 }
 
@@ -374,7 +348,7 @@ def test_a_filterpy_use_gives_the_same_bits(scenario: Callable[[type], list]) ->
 
 def test_the_page_lists_these_uses() -> None:
     page = (ROOT / "docs" / "filterpy.md").read_text(encoding="utf-8")
-    assert {row[0] for row in table_of(page, "Parts of filterpy that were compared")} == {*STEPS, *USES}
+    assert {row[0] for row in table_of(page, "Parts of filterpy that were compared")} == {*ELSEWHERE, *USES}
 
 
 def test_the_imm_of_the_fork_runs_KFOPCs() -> None:

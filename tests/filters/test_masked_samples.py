@@ -139,37 +139,6 @@ def test_a_batch_with_gaps_is_its_steps_and_a_saver_keeps_it() -> None:
     np.testing.assert_array_equal(np.isnan(saver.z[..., 0]), zs.mask)
 
 
-def test_the_smoother_over_gaps_is_batch_least_squares() -> None:
-    """The states of all steps together, as one dense system with a row for each equation."""
-    kf, steps, zs = system(KFOPC), 12, record(12)
-    start, P = kf.x.copy(), kf.P.copy()
-    means, covariances, _, _ = kf.batch_filter(zs)
-    smoothed, smoothed_P, _, _ = kf.rts_smoother(means, covariances)
-
-    size = steps * STATES
-    information, right = np.zeros((size, size)), np.zeros((size, 1))
-    for k, z in enumerate(zs):
-        equations = np.zeros((STATES, size))  # x_k - F x_{k-1} = noise Q; the first state has F P F' + Q
-        equations[:, k * STATES : (k + 1) * STATES] = np.eye(STATES)
-        known, noise = kf.F @ start, kf.F @ P @ kf.F.T + kf.Q
-        if k:
-            equations[:, (k - 1) * STATES : k * STATES] = -kf.F
-            known, noise = np.zeros((STATES, 1)), kf.Q
-        information += equations.T @ np.linalg.solve(noise, equations)
-        right += equations.T @ np.linalg.solve(noise, known)
-        there = ~z.mask
-        rows = np.zeros((there.sum(), size))
-        rows[:, k * STATES : (k + 1) * STATES] = kf.H[there]
-        weighted = np.linalg.solve(kf.R[np.ix_(there, there)], rows).T
-        information += weighted @ rows
-        right += weighted @ z.data[there].reshape(-1, 1)
-    covariance = np.linalg.inv(information)
-    np.testing.assert_allclose(smoothed.reshape(-1, 1), covariance @ right, rtol=1e-9, atol=1e-10)
-    for k in range(steps):
-        part = slice(k * STATES, (k + 1) * STATES)
-        np.testing.assert_allclose(smoothed_P[k], covariance[part, part], rtol=1e-9, atol=1e-10)
-
-
 @pytest.mark.parametrize(
     ("z", "match"),
     [

@@ -420,7 +420,7 @@ def worst_errors(f: KalmanFilter, rows: np.ndarray, d: np.ndarray, exact: list[t
 
 
 @pytest.mark.parametrize("kind", ["unrelated", "line", "low-passed line", "tonal line"])
-@pytest.mark.parametrize("P0", [1e6, 1e9, 1e12])
+@pytest.mark.parametrize("P0", [1e9, 1e12])
 def test_a_large_initial_variance_costs_no_more_digits_than_in_filterpy(kind: str, P0: float) -> None:
     """The typical error over the seeds is no larger than filterpy's, of x as of P.
 

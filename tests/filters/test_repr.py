@@ -37,15 +37,3 @@ def test_up_to_eight_states_all_is_shown(make: Any) -> None:
     assert text.startswith(f"{type(make(8)).__name__} object\ndim_x = 8\n")
     assert "\nP = [[" in text
     assert repr(make(9)).startswith(f"<{type(make(9)).__name__}: dim_x 9, ")
-
-
-def test_a_repr_changes_nothing() -> None:
-    kf = KFOPC.random_walk(16, **NOISES)
-    other = KFOPC.random_walk(16, **NOISES)
-    for f in (kf, other):
-        for z in (1.0, 2.0):
-            f.predict()
-            f.update(z, H=np.linspace(1.0, 2.0, 16))
-            assert "norm of x" in repr(kf)
-    np.testing.assert_array_equal(kf.x, other.x)
-    np.testing.assert_array_equal(kf.P, other.P)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def test_a_filter_that_is_saved_at_any_sample_continues_to_the_bit(
 
 
 @pytest.mark.parametrize("name", FILTERS)
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy])
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda kf: pickle.loads(pickle.dumps(kf))])
 def test_a_copy_continues_and_the_filter_does_not_notice(name: str, copied: Any) -> None:
     kf, alone = FILTERS[name](), FILTERS[name]()
     for n in range(20):

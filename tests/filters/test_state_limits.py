@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
-from oracles.power_budget import System
-from scipy.linalg import toeplitz
 
 from kfopc_filterpy import KFOPC
 from kfopc_filterpy.filters import constrained
@@ -153,36 +151,6 @@ def test_a_state_that_is_known_does_not_move():
     assert_allclose(constrained(kf, upper=[3e8, 1.5]), [3e8, 1.5], rtol=1e-15)  # above by rounding alone
     kf.x, kf.P = np.array([1.0, 2.0]), np.zeros((2, 2))
     assert_allclose(constrained(kf, upper=5.0, equalities=([1.0, 0.0], 1.0)), kf.x)
-
-
-def test_the_price_of_KF_PB_is_this_limit_with_the_autocorrelation_matrix():
-    """KF-PB solves (A + price R) v = b: the estimate A^-1 b with the covariance A^-1, limited to v' R v <= rho.
-
-    `price_of` stops within 0.5 % of the power. With the power that it took as the limit, both are the same to rounding
-    with the condition of A.
-    """
-    rng = np.random.default_rng(4)
-    x = np.convolve(rng.standard_normal(4000), [1.0, 0.6, 0.2])
-    heard = np.convolve(x, [0.0, 1.0, 0.5])
-    taps = 12
-
-    def lags(signal):
-        middle = signal.size - 1
-        return np.correlate(signal, signal, "full")[middle - taps + 1 : middle + taps] / signal.size
-
-    A, R, b = lags(heard)[None, None], lags(x)[None, None], rng.standard_normal((1, taps))
-    A[0, 0, taps - 1] += 0.05
-    system = System(A, R, b)
-    whole, M = (toeplitz(lag[0, 0, taps - 1 :]) for lag in (system.A, system.R))
-    kf = SimpleNamespace(x=np.linalg.solve(whole, b[0]), P=np.linalg.inv(whole))
-    kf.P = 0.5 * (kf.P + kf.P.T)
-    for share in (0.9, 0.5, 0.1, 0.01):
-        rho = share * kf.x @ M @ kf.x
-        price, v, taken = system.price_of(rho, 0.0)
-        assert price > 0
-        assert abs(taken / rho - 1) < 0.005
-        assert_allclose(constrained(kf, power=(M, taken)), v[0], rtol=1e-8, atol=1e-10 * np.abs(v).max())
-    assert_allclose(constrained(kf, power=(M, 1.01 * kf.x @ M @ kf.x)), kf.x)  # price 0
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,254 @@
+"""KF-PB and the observer of a path against their law in numpy.
+
+Both do the same operations in other orders, so they differ by rounding, which the solutions enlarge: by 1e-9 of the signal's
+rms at most where nothing is decided. A decision, such as Newton's stop, could fall otherwise by a rounding error; in these
+cases none does, so 1e-6 leaves room for other machines.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from oracles.limiter import Limiter
+from oracles.power_budget import KNOWN, Plant, PowerBudget
+from oracles.signals import hard_clip, push
+
+from kfopc_filterpy import HardClipAmplifier, OutputLimiter, kf_pb, simulate
+from kfopc_filterpy.controllers import PowerBudgetController
+from kfopc_filterpy.controllers.posterior import PathObserver
+
+FS, RATE = 2000.0, 1e-6
+
+
+def paths(rng: np.random.Generator, K: int, J: int, taps: int) -> np.ndarray:
+    """Return random paths with a delay of three samples, which fade over their length."""
+    s = rng.standard_normal((K, J, taps)) * np.exp(-np.arange(taps) / (0.2 * taps))
+    s[..., :3] = 0.0
+    return s / np.sqrt(np.sum(s**2, axis=2, keepdims=True))
+
+
+def coloured(rng: np.random.Generator, channels: int, n: int) -> np.ndarray:
+    """Return noise that a short filter colours."""
+    white = rng.standard_normal((channels, n + 3))
+    return white[:, 3:] + 0.6 * white[:, 2:-1] - 0.3 * white[:, 1:-2] + 0.2 * white[:, :-3]
+
+
+def scene(seed: int, K: int, J: int, references: int, seconds: float, M: int = 16):
+    """Return paths, references and disturbances."""
+    rng = np.random.default_rng(seed)
+    n = round(seconds * FS)
+    x = coloured(rng, references, n)
+    primary = paths(rng, K, references, 28)
+    d = sum(np.array([np.convolve(primary[k, i], x[i])[:n] for k in range(K)]) for i in range(references))
+    return paths(rng, K, J, M), x, d + 0.03 * rng.standard_normal((K, n)), rng
+
+
+def pair(
+    s: np.ndarray,
+    taps: int,
+    references: int,
+    rated_power: np.ndarray,
+    spread: float,
+    *,
+    theirs: dict[str, Any] | None = None,
+    **ours: Any,
+) -> tuple[PowerBudget, PowerBudgetController]:
+    """Return oracle and controller with the same settings."""
+    common: dict[str, Any] = {"rated_power": rated_power, "fs": FS, "averaging_s": 2.0, "n_references": references}
+    oracle = PowerBudget(s_hat=s, n_taps=taps, spread=spread, **common, **theirs or {})
+    return oracle, kf_pb(taps, s, secondary_path_uncertainty=spread or None, **common, **ours)
+
+
+def played(
+    one: Any, x: np.ndarray, d: np.ndarray, true: Callable[[int], np.ndarray], on: int, heard: np.ndarray
+) -> np.ndarray:
+    """Return the control signals, (n, J), over references (I, n) and disturbances (K, n), with a true path of each sample."""
+    line, ys = np.zeros(true(0).shape[1:]), []
+    for n in range(on, x.shape[1]):
+        ys.append(np.array(one.control_signal(x[:, n])))
+        push(line, ys[-1])
+        if heard[n]:
+            one.update(d[:, n] - np.einsum("kjm,jm->k", true(n), line))
+        elif isinstance(one, PowerBudget):
+            one.adapt(None)
+    return np.array(ys)
+
+
+def compare(
+    oracle: PowerBudget,
+    controller: PowerBudgetController,
+    x: np.ndarray,
+    d: np.ndarray,
+    true: Callable[[int], np.ndarray],
+    *,
+    on: int = 0,
+    heard: np.ndarray | None = None,
+) -> None:
+    """Run both and compare what they play, and what they have learned."""
+    for n in range(on):
+        oracle.listen(x[:, n], d[:, n])
+    if on:
+        controller.listen(x[:, :on], d[:, :on])
+    heard = np.ones(x.shape[1], bool) if heard is None else heard
+    theirs, ours = (played(one, x, d, true, on, heard) for one in (oracle, controller))
+    scale = np.sqrt(np.mean(theirs**2))
+    assert scale > 1e-3, "nothing was played"
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=RATE * scale)
+    np.testing.assert_allclose(controller.power_weight, oracle.price, rtol=RATE, atol=RATE * np.max(oracle.price))
+    np.testing.assert_allclose(controller.measurement_noise, oracle.plant.q, rtol=1e-5)
+    for got, expected in ((controller.primary_path, oracle.plant.p), (controller.identified_path, oracle.plant.s)):
+        np.testing.assert_allclose(got, expected, rtol=1e-5, atol=RATE * np.max(np.abs(oracle.plant.theta)))
+    assert controller.alarms == oracle.alarms
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_one_channel(spread: float) -> None:
+    s, x, d, rng = scene(1, 1, 1, 1, 8.0)
+    estimated = s if spread == 0 else s + 0.05 * rng.standard_normal(s.shape)
+    oracle, core = pair(estimated, 24, 1, np.array([0.25 * np.mean(d**2)]), spread)
+    compare(oracle, core, x, d, lambda n: s)
+    assert np.mean(oracle.book) > 0.5
+
+
+def test_a_path_that_flips_its_polarity() -> None:
+    s, x, d, _ = scene(2, 1, 1, 1, 12.0)
+    oracle, core = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), 0.3)
+    compare(oracle, core, x, d, lambda n: s if n < 6.0 * FS else -s)
+    assert oracle.alarms
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_a_primary_path_that_flips_its_polarity(spread: float) -> None:
+    s, x, d, _ = scene(2, 1, 1, 1, 12.0)
+    d[:, round(6.0 * FS) :] *= -1.0
+    oracle, core = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), spread)
+    compare(oracle, core, x, d, lambda n: s)
+    assert oracle.alarms == 1
+    assert spread == 0.0 or oracle.plant.wrong >= 4  # the data were forgotten, in both
+
+
+@pytest.mark.parametrize(("K", "J", "references"), [(2, 2, 2), (3, 2, 1), (9, 1, 1), (1, 3, 1), (2, 1, 3)])
+def test_several_channels(K: int, J: int, references: int) -> None:
+    """Nine microphones are more than a solution takes at once."""
+    s, x, d, _ = scene(4, K, J, references, 3.0)
+    oracle, core = pair(s, 9, references, np.linspace(0.25, 0.1, J) * np.mean(d**2), 0.3)
+    compare(oracle, core, x, d, lambda n: s)
+
+
+def test_a_factorisation_that_takes_several_blocks() -> None:
+    s, x, d, _ = scene(9, 1, 1, 1, 2.5, M=400)
+    oracle, core = pair(s, 200, 1, np.array([0.25 * np.mean(d**2)]), 0.3)
+    assert oracle.plant.delay > 2
+    compare(oracle, core, x, d, lambda n: s)
+
+
+def test_missing_errors_after_silence() -> None:
+    """The control comes on in the middle of a block, and some blocks are not heard."""
+    s, x, d, rng = scene(5, 1, 1, 1, 6.0)
+    heard = np.ones(x.shape[1], bool)
+    heard[rng.integers(0, heard.size, 12)] = False
+    heard[5000:5600] = False
+    oracle, core = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), 0.3)
+    compare(oracle, core, x, d, lambda n: s, on=1501, heard=heard)
+
+
+def test_an_amplifier_model() -> None:
+    """The posterior takes what was played."""
+    s, x, d, _ = scene(6, 1, 1, 1, 6.0)
+    rated = np.array([0.25 * np.mean(d**2)])
+    both = pair(s, 24, 1, rated, 0.3, theirs={"amplifiers": [hard_clip(0.5)]}, amplifier=HardClipAmplifier(0.5))
+    compare(*both, x, d, lambda n: s)
+
+
+def test_a_limiter() -> None:
+    """The account takes what was asked, which the limiter, of half the rating, lets pass in part."""
+    s, x, d, _ = scene(6, 1, 1, 1, 6.0)
+    rated = 0.25 * np.mean(d**2)
+    own, theirs = (make(rated / 2, fs=FS, window_s=0.1) for make in (OutputLimiter, Limiter))
+    oracle, core = pair(s, 24, 1, np.array([rated]), 0.3, theirs={"limiters": [theirs]}, limiter=[own])
+    compare(oracle, core, x, d, lambda n: s)
+    assert theirs.gain < 1.0
+    assert np.mean(oracle.book[:10]) > 0.6
+
+
+def test_a_silent_reference_or_loudspeaker_leaves_the_others_at_work() -> None:
+    """The oracle takes neither: its matrices are singular."""
+    s, x, d, _ = scene(8, 2, 2, 2, 3.0)
+    s[:, 1] = 0.0
+    x[1] = 0.0
+    d = np.array([np.convolve(h, x[0])[: x.shape[1]] for h in ([0, 0, 0, 1, 0.5], [0, 0, 0, 0, 0.7])])
+    rated = 0.5 * np.mean(d**2)
+    controller = kf_pb(
+        12, s, rated_power=rated, fs=FS, averaging_s=2.0, secondary_path_uncertainty=None, n_references=2
+    )
+    result = simulate(controller, x, disturbance=d, secondary_path=s, fs=FS)
+    assert np.mean(result.error[:, -2000:] ** 2) < 0.9 * np.mean(d[:, -2000:] ** 2)
+    assert 0.2 * rated < np.mean(result.control_signal[0] ** 2) < 1.05 * rated
+    assert np.all(result.control_signal[1] == 0.0)
+
+
+# ---- The observer
+
+
+class Observer:
+    """The numpy posterior, which takes blocks, fed sample by sample."""
+
+    def __init__(self, s: np.ndarray, taps: int, references: int, block: int) -> None:
+        self.J, M = s.shape[1:]
+        self.B, self.N, self.heard, self.alarms = block, taps + M - 1, 0, 0
+        self.plant = Plant(s, references, self.N, block, 0.3, math.exp(-block / (5.0 * FS)))
+        self.signals = np.zeros((references + self.J, taps + self.N + block))
+        self.new: list[tuple[np.ndarray, np.ndarray | None]] = []
+
+    def take(self, signals: np.ndarray, e: np.ndarray | None) -> None:
+        self.new.append((signals, e))
+        if len(self.new) < self.B:
+            return
+        heard = [e for _, e in self.new if e is not None]
+        self.signals = np.concatenate((self.signals[:, self.B :], np.transpose([z for z, _ in self.new])), axis=1)
+        if len(heard) == self.B and self.heard >= self.N:
+            known = self.heard / self.B * (1 - self.plant.forget) >= KNOWN
+            x, y = self.signals[: -self.J], self.signals[-self.J :]
+            self.alarms += self.plant.learn(x, y, np.transpose(heard), known)
+        self.heard += self.B
+        self.new = []
+
+
+@pytest.mark.parametrize(("channels", "taps"), [((1, 1, 1), 24), ((2, 2, 2), 12)])
+def test_it_learns_what_the_oracle_learns(channels: tuple[int, int, int], taps: int) -> None:
+    """Silence at first, errors that never come, and a path whose polarity changes, which is an alarm."""
+    K, J, references = channels
+    s, x, d, rng = scene(11, K, J, references, 6.0)
+    y, n = coloured(rng, J, x.shape[1]), x.shape[1]
+    y[:, :1000] = 0.0
+    anti_noise = np.array([sum(np.convolve(s[k, j], y[j])[:n] for j in range(J)) for k in range(K)])
+    e = d - np.where(np.arange(n) < 7001, 1.0, -1.0) * anti_noise
+    heard = rng.random(n) > 1e-3
+    heard[9000:9300] = False
+    estimate = s + 0.1 * paths(rng, K, J, s.shape[2])
+    observer = PathObserver(taps, estimate, n_references=references, spread=0.3, fs=FS, memory_s=5.0)
+    oracle, fits = Observer(estimate, taps, references, observer.block), 0
+    for t in range(n):
+        signals = np.concatenate((x[:, t], y[:, t]))
+        assert not observer.control_signal(signals).any()  # it plays nothing
+        if heard[t]:
+            observer.update(e[:, t])
+        oracle.take(signals, e[:, t] if heard[t] else None)
+        if heard[t] and oracle.plant.fits > fits:
+            fits = oracle.plant.fits
+            expected = oracle.plant.theta.reshape(K, -1)
+            theta = np.concatenate(
+                (observer.primary_path.reshape(K, -1), observer.identified_path.reshape(K, -1)), axis=1
+            )
+            np.testing.assert_allclose(theta, expected, rtol=0, atol=RATE * np.max(np.abs(expected)), err_msg=f"{t}")
+            np.testing.assert_allclose(observer.measurement_noise, oracle.plant.q, rtol=RATE, err_msg=f"{t}")
+            assert observer.fits == fits
+            assert observer.alarms == oracle.alarms
+    assert fits > 20
+    assert oracle.alarms == 1
+    # The noise is 30 dB below the disturbance: -20 dB of the path is left if it was learned again from seconds of data.
+    assert np.sum((observer.identified_path + s) ** 2) < 0.01 * np.sum(s**2)
