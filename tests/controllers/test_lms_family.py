@@ -18,7 +18,6 @@ from kfopc_filterpy import (
     ClippingFxLMS,
     FxLMS,
     FxNLMS,
-    HardClipAmplifier,
     LeakyFxLMS,
     MOVFxLMS,
     OptimalLeakyFxLMS,
@@ -212,38 +211,6 @@ def run(controller: Any, x: np.ndarray) -> Any:
 
 
 ONE_PATH = np.array([0.0, 0.7, -0.25, 0.1])
-ONE: dict[str, Callable[..., Any]] = {
-    "FxLMS": lambda path, **o: FxLMS(L, path, step_size=0.01, **o),
-    "FxNLMS": lambda path, **o: FxNLMS(L, path, step_size=0.1, **o),
-    "leaky FxLMS": lambda path, **o: LeakyFxLMS(L, path, step_size=0.01, leak=0.4, **o),
-    "MOV-FxLMS": lambda path, **o: MOVFxLMS(L, path, step_size=0.01, rated_power=0.4, **o),
-    "two-gradient FxLMS": lambda path, **o: TwoGradientFxLMS(L, path, step_size=0.01, amplitude_limit=0.3, **o),
-}
-
-
-@pytest.mark.parametrize(("name", "loudspeakers"), [*((name, 2) for name in ONE), ("FxLMS", 1)])
-def test_one_loudspeaker_is_the_single_channel_bit_for_bit(name: str, loudspeakers: int) -> None:
-    """A second one, which is not heard, changes nothing."""
-    x, other = noises(300)
-    d = np.convolve(x, [0.0, 0.0, 1.2, 0.5])[:300] + 0.1 * other
-    paths = np.stack([ONE_PATH, 0.0 * ONE_PATH])[np.newaxis, :loudspeakers]
-    single, many = ONE[name](ONE_PATH), ONE[name](paths)
-    options: dict[str, Any] = {
-        "fs": FS,
-        "amplifier": HardClipAmplifier(0.5),
-        "switch_on_s": 30 / FS,
-        "record_weights_every": 5,
-    }
-    want = simulate(single, x, disturbance=d, secondary_path=ONE_PATH, **options)
-    got = simulate(many, x[np.newaxis], disturbance=d[np.newaxis], secondary_path=paths, **options)
-    for signal in ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor"):
-        np.testing.assert_array_equal(getattr(got, signal)[0], getattr(want, signal), err_msg=signal)
-    np.testing.assert_array_equal(got.control_signal[1:], 0.0)
-    np.testing.assert_array_equal(got.weights[:, 0, 0], want.weights)
-    for attribute in ("weights", "disturbance_power", "secondary_path_gain", "constraint_factor"):
-        one = np.asarray(getattr(many, attribute))[0]
-        np.testing.assert_array_equal(one.reshape(np.shape(getattr(single, attribute))), getattr(single, attribute))
-    assert got.algorithm == want.algorithm
 
 
 # ---- Several channels: where they settle
@@ -308,8 +275,8 @@ def test_several_references_need_no_channel_axes() -> None:
     [
         (lambda c: c.update([0.1, 0.2]), "error must have a value for each of the 3 microphones, got 2"),
         (lambda c: c.control_signal(1.0), "reference must have a value for each of the 2 references, got 1"),
-        (lambda c: c.listen(np.ones((1, 9)), np.ones((3, 9))), "with I = 2, K = 3, got"),
-        (lambda c: c.listen(np.ones((2, 9)), np.ones((3, 8))), "with I = 2, K = 3, got"),
+        (lambda c: c.listen(np.ones((1, 9)), np.ones((3, 9))), "references"),
+        (lambda c: c.listen(np.ones((2, 9)), np.ones((3, 8))), "references"),
         (lambda c: run(c, noises(9, 1)), r"I = 1 of reference"),
         (
             lambda c: simulate(c, noises(9), disturbance=np.ones((2, 9)), secondary_path=PATHS[:2], fs=FS),
