@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.optimize
+from helpers.channels import random_paths
 from helpers.comparing import assert_same_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -183,19 +184,14 @@ def test_two_gradients_settle_where_they_balance(ratio: float) -> None:
     assert amplitude == pytest.approx(expected, rel=0.02)
 
 
-# ---- Refusals
-
-
 # ---- Several channels
 
 
 K, J, I = 3, 2, 2  # microphones, loudspeakers, references  # noqa: E741
 FS = 16000.0
-_rng = np.random.default_rng(5)
-PATHS = np.zeros((K, J, 6))  # true secondary paths
-PATHS[:, :, 1:5] = _rng.standard_normal((K, J, 4)) * [0.8, 0.5, 0.3, 0.2]
+PATHS = 0.7 * random_paths(K, J, 6, seed=5)  # true secondary paths
 ESTIMATES = 0.9 * PATHS[:, :, :4]  # what the controllers know of them
-PRIMARY = _rng.standard_normal((K, I, 7)) * 0.5
+PRIMARY = random_paths(K, I, 7, seed=6)
 
 
 def noises(n: int = 400, n_references: int = I) -> np.ndarray:
@@ -265,9 +261,6 @@ def test_several_references_need_no_channel_axes() -> None:
     assert one.weights.shape == (1, 2, L)
     assert repr(one) == "<FxLMS: 1 microphone, 1 loudspeaker, 2 references, 5 taps, constraint factor 1>"
     assert one.control_signal([1.0, 2.0]).shape == (1,)
-
-
-# ---- Refusals
 
 
 @pytest.mark.parametrize(

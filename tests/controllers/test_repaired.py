@@ -99,6 +99,3 @@ def test_the_trim_keeps_the_rated_power_where_eq_13_misses_it() -> None:
     # the trim averages over 1 s; a second of a band of 1400 Hz scatters by 3 %, four by half
     for repairs in (PUBLISHED | {"trim_s": 1.0}, {"gain_of": "reference"}, {"factor_at": "measurement"}, {}):
         assert power_with(**repairs) == pytest.approx(1.0, rel=0.02)
-
-
-# ---- Refusals

@@ -95,10 +95,8 @@ def test_ten_thousand_steps_as_filterpy(n: int, kind: str, P0: float, alpha: flo
     require_close(kf, ours)
 
 
-# What is mixed with fast steps: filterpy's own equations take over for a step, or an edit comes in.
-
-
-# Each is done to both filters with random numbers that start alike.
+# What is mixed with fast steps: filterpy's own equations take over for a step, or an edit comes in. Each
+# is done to both filters with random numbers that start alike.
 
 
 def assigned_F(f: KalmanFilter, rng: np.random.Generator) -> None:
