@@ -9,26 +9,16 @@ import numpy as np
 import pytest
 from helpers.controllers import MAKERS, quickly_verified
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, S, noises
+from helpers.simulation import Integrator
 
 from kfopc_filterpy import FxLMS, LimitedController, OutputLimiter, simulate
 from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.paths import fir_path
 
-
-class Proportional:
-    """A controller of one's own."""
-
-    def control_signal(self, reference: float) -> float:
-        return 0.3 * reference
-
-    def update(self, error: float) -> None:
-        pass
-
-
 CASES: dict[str, Any] = {name: MAKERS[name] for name in ("FxLMS", "KF-ANC", "KF-OPC", "KF-PB")} | {
     "verified path": lambda: quickly_verified(MAKERS["FxLMS"]()),
-    "limited": lambda: LimitedController(Proportional(), OutputLimiter(0.05, fs=FS, window_s=0.01)),
-    "own": Proportional,
+    "limited": lambda: LimitedController(Integrator(), OutputLimiter(0.05, fs=FS, window_s=0.01)),
+    "own": Integrator,
 }
 
 
@@ -95,7 +85,7 @@ def test_what_was_played_before_a_pause_is_still_subtracted() -> None:
     np.testing.assert_array_equal(one.controller.heard, np.zeros(3))
     assert copy.deepcopy(one).control_signal(2.0) == 2.0
     with pytest.raises(ValueError, match="listen"):
-        FeedbackNeutralizer(Proportional(), [0.0, 1.0]).listen([0.0], [0.0])
+        FeedbackNeutralizer(Integrator(), [0.0, 1.0]).listen([0.0], [0.0])
 
 
 ONE, SEVERAL = MAKERS["FxLMS"](), FxLMS(4, np.ones((2, 3, 4)), step_size=0.1, n_references=2)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.simulation import Integrator
 
 from kfopc_filterpy import (
     DiagonalKalman,
@@ -49,16 +50,6 @@ WRAPPERS: dict[str, Any] = {
 }
 
 
-class Own:
-    """A user's controller, without any setting."""
-
-    def control_signal(self, reference: float) -> float:
-        return 0.1 * reference
-
-    def update(self, error: float) -> None:
-        pass
-
-
 def control_signal(controller: Any) -> np.ndarray:
     several = controller.multichannel
     path, x = (PATHS, X[np.newaxis]) if several else (PATH, X)
@@ -99,15 +90,15 @@ def test_what_is_assigned_to_a_wrapper_reaches_the_controller(name: str) -> None
 
 @pytest.mark.parametrize("setting", ["limiter", "rated_power", "secondary_path", "secondary_path_uncertainty"])
 def test_a_setting_that_the_controller_lacks_is_not_taken(setting: str) -> None:
-    wrapper, own = FeedbackNeutralizer(Own(), [0.0, 0.1]), Own()
-    with pytest.raises(AttributeError, match=f"Own has no {setting} that could be assigned"):
+    wrapper, own = FeedbackNeutralizer(Integrator(), [0.0, 0.1]), Integrator()
+    with pytest.raises(AttributeError, match=f"Integrator has no {setting} that could be assigned"):
         setattr(wrapper, setting, 1.0)
     assert not hasattr(wrapper, setting)
     assert not hasattr(own, setting)
 
 
 def test_the_limiter_of_a_users_controller_can_be_replaced() -> None:
-    controller = FeedbackNeutralizer(LimitedController(Own(), OutputLimiter(1.0)), [0.0, 0.1])
+    controller = FeedbackNeutralizer(LimitedController(Integrator(), OutputLimiter(1.0)), [0.0, 0.1])
     controller.limiter = limiter = OutputLimiter(0.5)
     assert controller.controller.limiter is limiter
     with pytest.raises(TypeError, match="limiter must be an OutputLimiter, got 1"):
