@@ -1,7 +1,7 @@
 """Masked components of a measurement are missing.
 
 The run with None written by hand is the oracle where all are masked, bit for bit. Where some are, it is filterpy's update
-with their rows left out of H and R, and over a whole record dense batch least squares.
+with their rows left out of H and R.
 """
 
 from __future__ import annotations
