@@ -69,7 +69,7 @@ def both(filters: tuple[KalmanFilter, KFOPC], action: Callable[[Any], Any]) -> N
         (6, "unrelated", 1e3, 1.0, 1),
         (16, "low-passed line", 1.0, 1.0, 2),
         (7, "line", 10.0, 1.001, 2),
-        (66, "line", 1e3, 1.0, 2),
+        (34, "line", 1e3, 1.0, 2),
     ],
 )
 def test_ten_thousand_steps_as_filterpy(n: int, kind: str, P0: float, alpha: float, x_ndim: int) -> None:
