@@ -109,15 +109,15 @@ def compare(
 def test_one_channel(spread: float) -> None:
     s, x, d, rng = scene(1, 1, 1, 1, 8.0)
     estimated = s if spread == 0 else s + 0.05 * rng.standard_normal(s.shape)
-    oracle, core = pair(estimated, 24, 1, np.array([0.25 * np.mean(d**2)]), spread)
-    compare(oracle, core, x, d, lambda n: s)
+    oracle, controller = pair(estimated, 24, 1, np.array([0.25 * np.mean(d**2)]), spread)
+    compare(oracle, controller, x, d, lambda n: s)
     assert np.mean(oracle.book) > 0.5
 
 
 def test_a_path_that_flips_its_polarity() -> None:
     s, x, d, _ = scene(2, 1, 1, 1, 12.0)
-    oracle, core = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), 0.3)
-    compare(oracle, core, x, d, lambda n: s if n < 6.0 * FS else -s)
+    oracle, controller = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), 0.3)
+    compare(oracle, controller, x, d, lambda n: s if n < 6.0 * FS else -s)
     assert oracle.alarms
 
 
@@ -125,8 +125,8 @@ def test_a_path_that_flips_its_polarity() -> None:
 def test_a_primary_path_that_flips_its_polarity(spread: float) -> None:
     s, x, d, _ = scene(2, 1, 1, 1, 12.0)
     d[:, round(6.0 * FS) :] *= -1.0
-    oracle, core = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), spread)
-    compare(oracle, core, x, d, lambda n: s)
+    oracle, controller = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), spread)
+    compare(oracle, controller, x, d, lambda n: s)
     assert oracle.alarms == 1
     assert spread == 0.0 or oracle.plant.wrong >= 4  # the data were forgotten, in both
 
@@ -135,15 +135,15 @@ def test_a_primary_path_that_flips_its_polarity(spread: float) -> None:
 def test_several_channels(K: int, J: int, references: int) -> None:
     """Nine microphones are more than a solution takes at once."""
     s, x, d, _ = scene(4, K, J, references, 3.0)
-    oracle, core = pair(s, 9, references, np.linspace(0.25, 0.1, J) * np.mean(d**2), 0.3)
-    compare(oracle, core, x, d, lambda n: s)
+    oracle, controller = pair(s, 9, references, np.linspace(0.25, 0.1, J) * np.mean(d**2), 0.3)
+    compare(oracle, controller, x, d, lambda n: s)
 
 
 def test_a_factorisation_that_takes_several_blocks() -> None:
     s, x, d, _ = scene(9, 1, 1, 1, 2.5, M=400)
-    oracle, core = pair(s, 200, 1, np.array([0.25 * np.mean(d**2)]), 0.3)
+    oracle, controller = pair(s, 200, 1, np.array([0.25 * np.mean(d**2)]), 0.3)
     assert oracle.plant.delay > 2
-    compare(oracle, core, x, d, lambda n: s)
+    compare(oracle, controller, x, d, lambda n: s)
 
 
 def test_missing_errors_after_silence() -> None:
@@ -152,8 +152,8 @@ def test_missing_errors_after_silence() -> None:
     heard = np.ones(x.shape[1], bool)
     heard[rng.integers(0, heard.size, 12)] = False
     heard[5000:5600] = False
-    oracle, core = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), 0.3)
-    compare(oracle, core, x, d, lambda n: s, on=1501, heard=heard)
+    oracle, controller = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), 0.3)
+    compare(oracle, controller, x, d, lambda n: s, on=1501, heard=heard)
 
 
 def test_an_amplifier_model() -> None:
@@ -169,8 +169,8 @@ def test_a_limiter() -> None:
     s, x, d, _ = scene(6, 1, 1, 1, 6.0)
     rated = 0.25 * np.mean(d**2)
     own, theirs = (make(rated / 2, fs=FS, window_s=0.1) for make in (OutputLimiter, Limiter))
-    oracle, core = pair(s, 24, 1, np.array([rated]), 0.3, theirs={"limiters": [theirs]}, limiter=[own])
-    compare(oracle, core, x, d, lambda n: s)
+    oracle, controller = pair(s, 24, 1, np.array([rated]), 0.3, theirs={"limiters": [theirs]}, limiter=[own])
+    compare(oracle, controller, x, d, lambda n: s)
     assert theirs.gain < 1.0
     assert np.mean(oracle.book[:10]) > 0.6
 
