@@ -92,7 +92,19 @@ def test_the_estimator_may_keep_a_flat_state():
     assert flat.x.shape == (6,)
 
 
-# ---- What they settle to
+@pytest.mark.parametrize("by_block", [False, True])
+def test_a_refused_update_leaves_no_prediction_behind(by_block):
+    """S could overflow: each attempt would add the state noise to P."""
+    options = {"state_noise": 1e-3, "measurement_noise": 1e-2, "initial_variance": 1e290}
+    controller = kf_opc(8, [1.0], rated_power=1.0, **options)
+    controller.control_signal(1e20)
+    before = copy.deepcopy(controller)
+    for _ in range(3):
+        with pytest.raises(ValueError, match="the covariance P is too large"):
+            controller.process([1e20], [0.5]) if by_block else controller.update(0.5)
+    np.testing.assert_array_equal(controller.covariance, before.covariance)
+    np.testing.assert_array_equal(controller.weights, before.weights)
+    assert controller.constraint.disturbance_power == before.constraint.disturbance_power
 
 
 @pytest.mark.parametrize("kind", ["random walk", "full", "filterpy"])
@@ -117,6 +129,9 @@ def test_a_refused_update_of_an_estimator_leaves_no_prediction_behind(kind):
     controller.control_signal(2.0)
     controller.update(1.0)
     assert kf.x[0] != before.x[0]
+
+
+# ---- What they settle to
 
 
 def test_kf_opc_of_a_flat_path_keeps_its_rated_power():
