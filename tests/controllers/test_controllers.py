@@ -95,7 +95,7 @@ def test_the_estimator_may_keep_a_flat_state():
 @pytest.mark.parametrize("by_block", [False, True])
 def test_a_refused_update_leaves_no_prediction_behind(by_block):
     """S could overflow: each attempt would add the state noise to P."""
-    options = {"state_noise": 1e-3, "measurement_noise": 1e-2, "initial_variance": 1e290}
+    options = {"state_noise": 1e280, "measurement_noise": 1e-2, "initial_variance": 1e290}
     controller = kf_opc(8, [1.0], rated_power=1.0, **options)
     controller.control_signal(1e20)
     before = copy.deepcopy(controller)
