@@ -249,6 +249,13 @@ def test_a_control_signal_that_is_not_finite_is_silence_and_another_start(value:
     assert np.any(y[-100:])
 
 
+def test_a_control_signal_that_is_never_finite_is_one_event() -> None:
+    x, d = noises(1.0)
+    controller = verified(Own(0))
+    assert not run(controller, x, d, S)[1].any()
+    assert names(controller) == ["not finite"]
+
+
 def test_blocks_around_a_controller_that_states_no_channels() -> None:
     x, d = noises(0.2)
     blocks, steps = verified(Own(10**6)), verified(Own(10**6))

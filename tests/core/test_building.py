@@ -113,6 +113,11 @@ def test_unknown_level_is_refused() -> None:
     assert "baseline" in message
 
 
+def test_unknown_real_is_refused() -> None:
+    with pytest.raises(ValueError, match="real must be one of"):
+        library.load("half")
+
+
 def test_libraries_of_this_machine_are_current() -> None:
     """One that is left over from an earlier build would not be noticed before somebody asks for its level."""
     for path in building.FOLDER.glob("libanc-*"):
@@ -205,10 +210,12 @@ def test_zig_is_taken_where_the_machine_has_no_compiler(tmp_path: Path, no_flags
 def test_only_zig_builds_for_other_machines(tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
     no_flags.setenv("CC", "gcc")
     no_flags.setattr(building.importlib.util, "find_spec", lambda name: object())
-    assert building.compiler("aarch64-linux-musl") == [sys.executable, "-m", "ziglang", "cc"]
+    command, target = [sys.executable, "-m", "ziglang", "cc"], "aarch64-linux-musl"
+    assert building.compiler(target) == command
+    assert {"-mcpu=baseline", "-target", target} <= set(building.flags(command, target=target))
     no_flags.setattr(building.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(building.BuildError, match="only zig builds for other machines"):
-        building.build(building.core_sources(), tmp_path / "lib.so", target="aarch64-linux-musl")
+        building.build(building.core_sources(), tmp_path / "lib.so", target=target)
 
 
 @pytest.mark.parametrize("real", building.REALS)

@@ -184,6 +184,8 @@ RECORD = np.random.default_rng(0).standard_normal(40)
         (RECORD, {"Q_parts": [], "R_parts": []}, "nothing to learn"),
         (RECORD, {"Q_parts": [np.eye(2)]}, r"Q_parts\[0\] must have shape \(1, 1\), got \(2, 2\)"),
         (RECORD, {"R_parts": [[[-1.0]]]}, r"R_parts\[0\] must be symmetric and positive semidefinite"),
+        (RECORD, {"Q_parts": [np.zeros((1, 1))]}, r"Q_parts\[0\] must not be zero"),
+        (RECORD, {"H": np.zeros((1, 1))}, "H must not be zero"),
         (RECORD, {"R_parts": [[[1.0]], [[2.0]]]}, "R_parts must not be sums of multiples"),
         (RECORD, {"H": np.ones((39, 1, 1))}, "one matrix for each of the 40 samples of z, got 39"),
         (RECORD, {"H": np.ones((1, 3))}, r"F must be \(1, 1\) and H \(dim_z, 1\)"),

@@ -449,6 +449,19 @@ def test_a_silent_filter_of_no_variance_is_refused() -> None:
     np.testing.assert_allclose(ours.x[:, 0], np.full(3, 1 / 3))
 
 
+@pytest.mark.parametrize("x", [[np.nan, 0.0, 0.0], [0.0, 0.0]])
+def test_weights_that_are_no_weights_are_refused_by_both_steps(x: list[float]) -> None:
+    kf = KFOPC.random_walk(3, state_noise=1e-3, measurement_noise=1.0)
+    kf.predict()
+    kf.x = np.array(x)
+    P = kf.P.copy()
+    with pytest.raises(ValueError, match="x must have 3 finite values"):
+        kf.predict()
+    with pytest.raises(ValueError, match="x must have 3 finite values"):
+        kf.update(1.0, H=np.ones(3))
+    assert np.array_equal(kf.P, P)
+
+
 def test_an_inverse_of_ones_own_is_used() -> None:
     """A silent reference with R = 0 and the pseudo-inverse: filterpy's filter goes on, its gain is 0."""
     ours, theirs = KFOPC.random_walk(2, state_noise=0.5, measurement_noise=0.0), KalmanFilter(2, 1)

@@ -161,6 +161,7 @@ def test_a_state_that_is_known_does_not_move():
         ({"equalities": np.eye(3)}, TypeError, r"equalities must be a pair of a matrix \(m, 3\)"),
         ({"equalities": (np.eye(3), 1.0)}, ValueError, "one row and one value for each limit"),
         ({"inequalities": ([1.0, np.nan, 0.0], 1.0)}, ValueError, r"inequalities\[0\] must be finite"),
+        ({"power": np.eye(3)}, TypeError, "power must be a pair"),
         ({"power": (np.eye(2), 1.0)}, ValueError, r"power\[0\] must have shape \(3, 3\), got \(2, 2\)"),
         ({"power": (np.eye(3), 0.0)}, ValueError, r"power\[1\] must be greater than 0"),
         ({"power": (-np.eye(3), 1.0)}, ValueError, "symmetric and positive semidefinite.*negative variances"),
