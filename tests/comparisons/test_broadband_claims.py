@@ -22,7 +22,6 @@ from kfopc_filterpy.bench import make_scene, with_clipping
     ("powers", "held"),
     [
         ([1.004, 1.004], True),
-        ([0.996, 0.996], True),
         ([1.006, 1.006], False),  # the mean
         ([0.994, 0.994], False),
         ([0.986, 1.014], True),
@@ -36,34 +35,21 @@ def test_power(powers: list[float], held: bool) -> None:
 
 @pytest.mark.parametrize(
     ("anc_db", "others_db", "power", "held"),
-    [
-        (6.1, 6.0, 1.51, True),
-        (5.9, 6.0, 4.0, False),
-        (50.0, 6.0, 1.49, False),
-        (np.nan, 6.0, 4.0, False),
-        (50.0, np.nan, 4.0, False),
-    ],
+    [(6.1, 6.0, 1.51, True), (5.9, 6.0, 4.0, False), (50.0, 6.0, 1.49, False), (50.0, np.nan, 4.0, False)],
 )
 def test_best_reduction(anc_db: float, others_db: float, power: float, held: bool) -> None:
     for best_other in ("KF-OPC", "FxLMS", "MOV-FxLMS"):
         reductions = {"KF-ANC": anc_db, "KF-OPC": 1.0, "FxLMS": 1.0, "MOV-FxLMS": 1.0} | {best_other: others_db}
         powers = dict.fromkeys(reductions, 1.0) | {"KF-ANC": power}
         assert broadband.best_reduction_claim(reductions, powers).holds is held
-        assert broadband.best_reduction_claim(dict(reversed(reductions.items())), powers).holds is held
 
 
 @pytest.mark.parametrize(
     ("opc", "anc", "held"),
-    [
-        (1.09, 1.0, True),
-        (1.11, 1.0, False),
-        (None, 1.0, False),
-        (np.nan, 1.0, False),
-        (1.0, None, True),  # KF-ANC does not settle, KF-OPC does
-        (None, None, False),
-    ],
+    [(1.09, 1.0, True), (1.11, 1.0, False), (np.nan, 1.0, False), (1.0, None, True), (None, None, False)],
 )
 def test_not_slower(opc: float | None, anc: float | None, held: bool) -> None:
+    """None: it does not settle."""
     reached = dict.fromkeys(("KF-ANC", "KF-OPC", "MOV-FxLMS"), 0.0615)
     claim = broadband.not_slower_claim({"KF-ANC": anc, "KF-OPC": opc, "MOV-FxLMS": None}, reached)
     assert claim.holds is held
@@ -72,23 +58,14 @@ def test_not_slower(opc: float | None, anc: float | None, held: bool) -> None:
 
 @pytest.mark.parametrize(
     ("opc", "mov", "held"),
-    [
-        (1.0, 2.01, True),
-        (1.0, 1.99, False),
-        (1.0, None, True),
-        (None, 2.0, False),
-        (None, None, False),
-        (np.nan, 2.0, False),
-    ],
+    [(1.0, 2.01, True), (1.0, 1.99, False), (1.0, None, True), (None, None, False), (np.nan, 2.0, False)],
 )
 def test_twice_as_fast(opc: float | None, mov: float | None, held: bool) -> None:
     claim = broadband.faster_claim({"KF-ANC": 1.0, "KF-OPC": opc, "FxLMS": 1.0, "MOV-FxLMS": mov})
     assert claim.holds is held
-    both = opc is not None and mov is not None and np.isfinite(opc)
-    assert (f"{mov / opc:.2f} times as long" if both else "no ratio") in claim.measured
 
 
-@pytest.mark.parametrize(("coherence", "held"), [(1.0, True), (0.991, True), (0.99, False), (np.nan, False)])
+@pytest.mark.parametrize(("coherence", "held"), [(0.991, True), (0.99, False), (np.nan, False)])
 def test_linear(coherence: float, held: bool) -> None:
     assert broadband.linear_claim(coherence, 0.5, 6.0).holds is held
 
@@ -107,24 +84,16 @@ def clipped(**own: list[float]) -> dict[str, dict[str, Any]]:
 @pytest.mark.parametrize(
     ("own", "held"),
     [
-        ({}, True),
-        ({"first_second_noise_reduction_db": [3.61, 4.8]}, True),
         ({"first_second_noise_reduction_db": [4.0, 4.8], "steady_noise_reduction_db": [5.0, 4.6]}, True),  # 1 dB less
-        ({"first_second_noise_reduction_db": [3.59, 4.8]}, False),  # one seed will do
-        ({"first_second_noise_reduction_db": [4.8, 3.59]}, False),
-        ({"first_second_noise_reduction_db": [4.8, np.nan]}, False),
+        ({"first_second_noise_reduction_db": [4.8, 3.59]}, False),  # one seed will do
+        ({"first_second_noise_reduction_db": [np.nan, 4.8]}, False),
         ({"steady_noise_reduction_db": [5.81, 4.6]}, False),
         ({"output_power_of_each_seed": [0.79, 0.815]}, True),
-        ({"output_power_of_each_seed": [0.79, 0.817]}, False),
-        ({"output_power_of_each_seed": [np.inf, 0.79]}, False),
+        ({"output_power_of_each_seed": [0.817, 0.79]}, False),
     ],
 )
 def test_clipped(own: dict[str, list[float]], held: bool) -> None:
-    claim = broadband.clipped_claim(clipped(**own), 1.265)
-    assert claim.holds is held
-    assert "15.7 % of the samples are clipped" in claim.measured
-    # The first second of the q of a linear amplifier and of the known amplifier, which stay as they are.
-    assert claim.measured.count("4.7 to 4.8 dB, control signal up to 3.9 to 4.7") >= 2
+    assert broadband.clipped_claim(clipped(**own), 1.265).holds is held
 
 
 def test_the_first_second_is_a_whole_second_and_no_more() -> None:
@@ -153,13 +122,11 @@ def test_times_at_which_a_curve_settles() -> None:
     curve = np.array([1.0, 0.011, 0.009, 0.011, 0.0099, 0.001])
     steady = np.full(8, 0.001)
     assert settled_after_s(np.r_[curve, steady], -20.0) == 4 * step
-    assert settled_after_s(curve[:5], -20.0) is None  # there, but not for the second half of the run
     assert settled_after_s(np.r_[np.ones(8), steady], -20.0) == 8 * step
-    assert settled_after_s(np.r_[np.ones(9), steady], -20.0) is None
-    assert first_below_s(curve, -20.0) == 2 * step
-    assert settled_after_s(curve[:4], -20.0) is None
+    assert settled_after_s(np.r_[np.ones(9), steady], -20.0) is None  # not for the second half of the run
     assert settled_after_s(np.r_[curve, np.nan], -20.0) is None
     assert settled_after_s(curve[4:], -20.0) == 0.0
+    assert first_below_s(curve, -20.0) == 2 * step
     assert first_below_s(curve[:2], -20.0) is None
 
 

@@ -32,15 +32,6 @@ def report() -> Iterator[StudyReport]:
         yield run_study(study)
 
 
-def test_the_report_is_complete(report: StudyReport) -> None:
-    assert {row["kind"] for row in report.extra["rows"]} == {kf_pb_cases.STEADY, kf_pb_cases.CHANGING}
-    faults = {(row["fault"], row["begins"]) for row in report.extra["faults"]}
-    expected = {(fault, begins) for fault in kf_pb_cases.FAULTS for begins in ("start", "jump")}
-    assert faults == expected | {(fault, "jump") for fault in study.PRIMARY}
-    assert [table.stem for table in report.tables] == ["classes", "cases", "faults"]
-    assert len(report.claims) == 8
-
-
 def test_a_row_is_what_a_run_of_ones_own_says(report: StudyReport) -> None:
     row = next(row for row in report.extra["rows"] if row["noise"] == "band noise")
     case = kf_pb_cases.make_rated((PRIMARY, SECONDARY), kf_pb_cases.noises()["band noise"][1](), 0.25)

@@ -13,7 +13,7 @@ from comparisons.studies import tracking_events as events
 from comparisons.studies.tracking import TrackingRow
 from comparisons.studies.tracking_events import CHIRP_HZ, SWEEP_S, Event, change_scene, jump_scene, sweep, sweep_scene
 from kfopc_filterpy import convergence_time_s, noise_reduction_db, simulate
-from kfopc_filterpy.bench import StudyReport, make_controller
+from kfopc_filterpy.bench import make_controller
 from kfopc_filterpy.metrics import overshoot
 
 FS = 16000.0
@@ -31,24 +31,6 @@ def small() -> Any:
         chosen = [event for event in events.all_events() if event.name in names]
         with smaller(events, all_events=lambda: chosen):
             return run_study(tracking), events.scenes_of(chosen[1], short["duct"])
-
-
-def test_the_report_is_complete(small: Any) -> None:
-    report: StudyReport = small[0]
-    assert (report.name, report.claims_heading, len(report.claims)) == ("tracking", "Findings", 4)
-    assert [item.stem for item in report.figures] == ["20-db-louder", "sign", "one-sweep"]
-    assert [table.stem for table in report.tables] == ["reduction", "worst", "power", "settling"]
-    for table in report.tables[:3]:
-        assert list(table.headings) == ["event", "paths", *STUDIED]
-        assert [tuple(row[:2]) for row in table.rows] == [(n, "duct") for n in ("20 dB louder", "sign", "one sweep")]
-    settling = report.tables[3]
-    assert [tuple(row[:3]) for row in settling.rows] == [
-        ("20 dB louder", "louder", "duct"),
-        ("20 dB louder", "back", "duct"),
-        ("sign", "changed", "duct"),
-    ]
-    assert set(report.parameters["settings"].value) == {"20 dB louder, duct", "sign, duct", "one sweep, duct"}
-    assert len(report.extra["rows"]) == 3 * len(STUDIED)
 
 
 @pytest.mark.parametrize("algorithm", ["KF-PB", "FxLMS"])
@@ -132,7 +114,6 @@ def test_a_jump_is_of_the_reference(pair: Any) -> None:
 
 def test_events_say_where_they_happen() -> None:
     found = {event.name: event for event in events.all_events()}
-    assert list(found) == ["20 dB louder", "20 dB softer", "sign", "delay", "longer duct", "one sweep", "sweeps"]
     assert found["longer duct"].paths == ("duct",)
     names = [(event.name, path) for event, path in events.jobs({"duct": None, "measured duct": None})]
     assert len(names) == 13
@@ -188,9 +169,7 @@ GOOD = [
         (BACK, [louder("KF-OPC", 1.01)], True),
         (BACK, [louder("KF-OPC", 0.99)], False),
         (BACK, [louder("KF-OPC", None)], True),
-        *((BACK, [louder(name, 0.19)], True) for name in ("KF-PB", "KF-ANC")),
-        *((BACK, [louder(name, 0.21)], False) for name in ("KF-PB", "KF-ANC")),
-        *((BACK, [louder(name, None)], False) for name in ("KF-PB", "KF-ANC")),
+        *((BACK, [louder(name, t)], t == 0.19) for name in ("KF-PB", "KF-ANC") for t in (0.19, 0.21, None)),
     ],
 )
 def test_claims_on_both_sides_of_each_threshold(which: int, rows: list[TrackingRow], met: bool) -> None:

@@ -17,7 +17,6 @@ from comparisons.studies.uncertain_path import (
     STATED,
     AllowanceRow,
     claims,
-    jobs,
     seconds_db,
 )
 from kfopc_filterpy import SimulationResult, simulate
@@ -34,20 +33,6 @@ def report() -> StudyReport:
         assert list(noises) == ["compressor", "band noise", "wide band", "white", "high tone"]
         with smaller(uncertain_path, study_noises=lambda: {name: noises[name] for name in ("band noise", "white")}):
             return run_study(uncertain_path)
-
-
-def test_the_report_is_complete(report: StudyReport) -> None:
-    assert (report.name, report.claims_heading, len(report.claims)) == ("uncertain-path", "Findings", 5)
-    assert [item.stem for item in report.figures] == ["worst-seconds"]
-    assert report.notes[0] == "The measured duct was not at hand (KFOPC_DATA): it is left out."
-    rows = report.extra["rows"]
-    keys = [(row["noise"], row["error"], row["allowance"]) for row in rows]
-    assert len(keys) == len(set(keys)) == 2 * len(jobs())
-    for table, figure in zip(report.tables, ("worst_second_db", "noise_reduction_db"), strict=True):
-        assert table.headings == ["paths", "noise", "estimate", NOTHING, DEFAULT, STATED]
-        line = next(line for line in table.rows if line[1:3] == ["white", "a sample late"])
-        own = {r["allowance"]: r[figure] for r in rows if (r["noise"], r["error"]) == ("white", "a sample late")}
-        assert line[3:] == [own[NOTHING], own[DEFAULT], own[STATED]]
 
 
 def test_the_default_costs_little_and_the_rated_power_is_kept(report: StudyReport) -> None:
@@ -110,26 +95,11 @@ GOOD = [
 ]
 
 
-def changed(at: int, **figures: Any) -> list[AllowanceRow]:
-    return [replace(one, **figures) if n == at else one for n, one in enumerate(GOOD)]
-
-
-def test_all_findings_hold_on_good_rows() -> None:
-    found = claims(GOOD)
-    assert all(claim.holds for claim in found)
-    assert (
-        "if nothing is allowed for 1 of 1 do, the worst second is -7.0 dB (duct, white, a sample late)"
-        in found[0].measured
-    )
-    assert found[2].measured == "0.40 dB on average, 0.40 dB at worst (duct, motor)"
-
-
 @pytest.mark.parametrize(
     ("at", "figures", "finding"),
     [
         (2, {"worst_second_db": -0.1}, 0),
         (2, {"diverged_at_s": 1.0}, 0),
-        (3, {"worst_second_db": -0.1}, 1),
         (3, {"worst_second_db": np.nan}, 1),
         (1, {"noise_reduction_db": 4.4}, 2),
         (6, {"noise_reduction_db": 4.4}, 3),
@@ -139,4 +109,6 @@ def test_all_findings_hold_on_good_rows() -> None:
     ],
 )
 def test_each_finding_fails_alone(at: int, figures: dict[str, Any], finding: int) -> None:
-    assert [n for n, claim in enumerate(claims(changed(at, **figures))) if not claim.holds] == [finding]
+    assert all(claim.holds for claim in claims(GOOD))
+    changed = [replace(one, **figures) if n == at else one for n, one in enumerate(GOOD)]
+    assert [n for n, claim in enumerate(claims(changed)) if not claim.holds] == [finding]
