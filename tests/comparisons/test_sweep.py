@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
+import shutil
 from contextlib import chdir
 
 import numpy as np
@@ -14,8 +14,7 @@ from scipy import stats
 from comparisons.__main__ import main
 from comparisons.sweep.command import parsed_values
 from comparisons.sweep.grid import AXES, built_in_grid, own_grid
-from comparisons.sweep.jobs import as_figures
-from comparisons.sweep.results import cell_rows, mean_and_interval, sweep_figure, write_table
+from comparisons.sweep.results import cell_rows, mean_and_interval, sweep_figure
 from comparisons.sweep.run import run_sweep
 from comparisons.sweep.scenario import ScenarioError
 from comparisons.sweep.store import keep, kept
@@ -40,6 +39,19 @@ def moody(scenario):
 def swept(folder, grid=None, scenario=plane, **options):
     grid = {"slope": [1.0, 2.0, 3.0], "kind": ["a", "b"]} if grid is None else grid
     return run_sweep(grid, folder, scenario=scenario, **({"seeds": 4, "jobs": 1, "quiet": True} | options))
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """A sweep of 24 runs, and its folder."""
+    folder = tmp_path_factory.mktemp("sweep")
+    return swept(folder), folder
+
+
+@pytest.fixture
+def done(first, tmp_path):
+    """The sweep, and a copy of its folder."""
+    return first[0], shutil.copytree(first[1], tmp_path / "done")
 
 
 def read_csv(path):
@@ -74,28 +86,19 @@ def test_axes_not_named_have_their_default():
     assert grid.seeds == (1, 2)
 
 
-def test_an_algorithm_of_two_settings_has_to_be_tuned():
-    with pytest.raises(ValueError, match=r'leaky FxLMS has two settings.*give setting "tuned"'):
-        built_in_grid({"algorithm": ["KF-OPC", "leaky FxLMS"]}, 1)
-
-
 @pytest.mark.parametrize(
     ("axes", "message"),
     [
         ({"colour": "red"}, "no axis called colour; there are path, noise"),
         ({"algorithm": "KF-XYZ"}, "algorithm must be one of KF-ANC, KF-OPC, .*got 'KF-XYZ'"),
-        ({"algorithm": 3}, "algorithm must be one of"),
+        ({"algorithm": ["KF-OPC", "leaky FxLMS"]}, r'leaky FxLMS has two settings.*give setting "tuned"'),
         ({"path_delay": "late"}, "path_delay must be one of a number, got 'late'"),
         ({"algorithm": []}, "algorithm must have at least one value"),
         ({"n_taps": 0}, "n_taps must be at least 1, got 0"),
         ({"duration_s": [1.0, 0.0]}, "duration_s must be"),
-        ({"setting": 0.0}, "setting must be"),
         ({"setting": "best"}, "setting must be one of default, tuned, a number, got 'best'"),
         ({"rated_power_db": math.nan}, "rated_power_db must be"),
         ({"rated_power_db": [-10, -10.0]}, "rated_power_db must have at least one value, and none twice"),
-        ({"path": "pipe"}, "path must be one of band-pass, duct, measured duct, got 'pipe'"),
-        ({"noise": "silence"}, "noise must be one of tone, "),
-        ({"amplifier": "valve"}, "amplifier must be one of linear, hard clip, soft, got 'valve'"),
     ],
 )
 def test_grid_refuses_what_is_no_axis_or_value(axes, message):
@@ -104,33 +107,20 @@ def test_grid_refuses_what_is_no_axis_or_value(axes, message):
 
 
 @pytest.mark.parametrize(
-    ("seeds", "error", "message"),
+    ("axes", "seeds", "error", "message"),
     [
-        (0, ValueError, "seeds must be at least 1"),
-        ([], ValueError, "seeds must have at least one value"),
-        ([1, 1], ValueError, "seeds must have at least one value, and none twice"),
-        ([-1], ValueError, "seeds must be at least 0"),
-        (2.5, TypeError, "seeds must be a whole number"),
+        ({"a": 1}, 0, ValueError, "seeds must be at least 1"),
+        ({"a": 1}, [1, 1], ValueError, "seeds must have at least one value, and none twice"),
+        ({"a": 1}, [-1], ValueError, "seeds must be at least 0"),
+        ({}, 1, ValueError, "grid must have at least one axis"),
+        ({"seed": [1]}, 1, ValueError, 'none called "seed"'),
+        ({"a": [math.inf]}, 1, ValueError, "a must be finite"),
+        ({"a": [object()]}, 1, TypeError, "a must hold numbers, strings, booleans or None, got object"),
     ],
 )
-def test_seeds_refused(seeds, error, message):
+def test_own_axes_and_seeds_refused(axes, seeds, error, message):
     with pytest.raises(error, match=message):
-        own_grid({"a": 1}, seeds)
-
-
-@pytest.mark.parametrize(
-    ("axes", "error", "message"),
-    [
-        ({}, ValueError, "grid must have at least one axis"),
-        ({"seed": [1]}, ValueError, 'none called "seed"'),
-        ({"a": []}, ValueError, "a must have at least one value"),
-        ({"a": [math.inf]}, ValueError, "a must be finite"),
-        ({"a": [object()]}, TypeError, "a must hold numbers, strings, booleans or None, got object"),
-    ],
-)
-def test_own_axes_refused(axes, error, message):
-    with pytest.raises(error, match=message):
-        own_grid(axes, 1)
+        own_grid(axes, seeds)
 
 
 # Means and intervals.
@@ -145,22 +135,8 @@ def test_interval_is_that_of_scipy():
 
 
 def test_no_interval_for_one_seed_and_nothing_for_none():
-    assert mean_and_interval([5.0])[0] == 5.0
-    assert np.isnan(mean_and_interval([5.0])[1:3]).all()
-    assert mean_and_interval([5.0])[3] == 1
-    assert np.isnan(mean_and_interval([math.nan])[:3]).all()
-    assert mean_and_interval([])[3] == 0
-
-
-def test_cells_are_means_over_seeds(tmp_path):
-    sweep = swept(tmp_path)
-    assert len(sweep.cells) == 6
-    noise = [np.random.default_rng(seed).standard_normal() for seed in (1, 2, 3, 4)]
-    for cell in sweep.cells:
-        assert cell["height_mean"] == pytest.approx(2.0 * cell["slope"] + np.mean(noise), rel=1e-12)
-        half = stats.t.ppf(0.975, 3) * np.std(noise, ddof=1) / 2
-        assert cell["height_high"] - cell["height_mean"] == pytest.approx(half, rel=1e-9)
-        assert (cell["runs"], cell["diverged"], cell["height_n"], cell["count_mean"]) == (4, 0, 4, 3.0)
+    np.testing.assert_equal(mean_and_interval([5.0]), (5.0, math.nan, math.nan, 1))
+    np.testing.assert_equal(mean_and_interval([math.nan]), (math.nan, math.nan, math.nan, 0))
 
 
 def test_divergence_is_counted_and_drops_no_cell(tmp_path):
@@ -177,100 +153,68 @@ def test_divergence_is_counted_and_drops_no_cell(tmp_path):
 # Tables.
 
 
-def test_tables_hold_every_digit(tmp_path):
-    sweep = swept(tmp_path)
-    rows = read_csv(tmp_path / "runs.csv")
-    assert len(rows) == 24
+def test_tables_hold_every_digit(done):
+    sweep, folder = done
+    rows = read_csv(folder / "runs.csv")
     assert [float(row["height"]) for row in rows] == [run["height"] for run in sweep.runs]
     assert [row["kind"] for row in rows[:8]] == 4 * ["a"] + 4 * ["b"]
     assert list(rows[0]) == ["slope", "kind", "seed", "height", "count", "diverged"]
 
 
 def test_parquet_holds_what_csv_holds(tmp_path):
+    """A column of names and numbers becomes one of strings."""
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow, the extra parquet, is not installed")
-    sweep = swept(tmp_path, {"mood": ["good", "bad"], "level": [1, 2.5]}, moody, seeds=3, format="parquet")
+    sweep = swept(tmp_path, {"mood": ["good", "bad"], "level": [1, "loud"]}, moody, seeds=3, format="parquet")
     assert [path.name for path in sweep.files[:2]] == ["cells.parquet", "runs.parquet"]
     cells = parquet.read_table(tmp_path / "cells.parquet").to_pylist()
-    assert [cell["level"] for cell in cells] == [1.0, 2.5, 1.0, 2.5]
+    assert [cell["level"] for cell in cells] == ["1", "loud", "1", "loud"]
     assert [cell["height_mean"] for cell in cells] == [1.0, 1.0, None, None]
     assert not list(tmp_path.glob(".*"))  # no partial file left
-
-
-def test_column_of_names_and_numbers_becomes_strings(tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow, the extra parquet, is not installed")
-    write_table([{"setting": "default"}, {"setting": 0.5}], tmp_path / "mixed", "parquet")
-    assert parquet.read_table(tmp_path / "mixed.parquet").to_pylist() == [{"setting": "default"}, {"setting": "0.5"}]
 
 
 # The folder.
 
 
-def test_what_is_done_is_not_done_again(tmp_path):
-    CALLS.clear()
-    first = swept(tmp_path)
-    assert len(CALLS) == 24
-    again = swept(tmp_path)
-    assert len(CALLS) == 24
-    assert again.runs == first.runs
-    assert again.cells == first.cells
-
-
-@pytest.mark.parametrize("cut", [1, 2, 20, 60])
-def test_torn_line_is_done_again_and_harms_no_other(tmp_path, cut):
-    first = swept(tmp_path)
-    runs = tmp_path / "runs.jsonl"
+@pytest.mark.parametrize("cut", [0, 1, 20])
+def test_what_is_done_is_not_done_again_and_a_torn_line_harms_no_other(done, cut):
+    first, folder = done
+    runs = folder / "runs.jsonl"
     whole = runs.read_bytes()
-    runs.write_bytes(whole[:-cut])  # the kernel wrote a part of the last line
+    kept = whole[: len(whole) - cut]  # the kernel wrote a part of the last line
+    runs.write_bytes(kept)
     CALLS.clear()
-    again = swept(tmp_path)
-    assert len(CALLS) == (0 if cut == 1 else 1)  # without its newline alone, the line is whole
-    assert again.cells == first.cells
-    assert runs.read_bytes().startswith(whole[:-cut])  # nothing is rewritten
-    CALLS.clear()
-    assert swept(tmp_path).cells == first.cells
-    assert CALLS == []
+    again = swept(folder)
+    assert len(CALLS) == (1 if cut > 1 else 0)  # without its newline alone, the line is whole
+    assert (again.runs, again.cells) == (first.runs, first.cells)
+    assert runs.read_bytes().startswith(kept)  # nothing is rewritten
 
 
-def test_bytes_that_are_no_text_are_done_again(tmp_path):
-    first = swept(tmp_path)
-    lines = (tmp_path / "runs.jsonl").read_bytes().splitlines(keepends=True)
+def test_bytes_that_are_no_text_are_done_again(done):
+    first, folder = done
+    lines = (folder / "runs.jsonl").read_bytes().splitlines(keepends=True)
     lines[3] = b"\0\xff" * 20 + b"\n"  # what a power cut may leave of a block
-    (tmp_path / "runs.jsonl").write_bytes(b"".join(lines))
+    (folder / "runs.jsonl").write_bytes(b"".join(lines))
     CALLS.clear()
-    assert swept(tmp_path).cells == first.cells
-    assert len(CALLS) == 1
+    for calls in (1, 1):  # and then no more
+        assert swept(folder).cells == first.cells
+        assert len(CALLS) == calls
 
 
 @pytest.mark.parametrize(
     ("grid", "options", "message"),
     [
-        (
-            {"slope": [1.0, 2.0], "kind": ["a", "b"]},
-            {},
-            r"axis slope is \[1\.0, 2\.0, 3\.0\] there, but \[1\.0, 2\.0\] here",
-        ),
-        ({"slope": [1.0, 2.0, 3.0], "sort": ["a", "b"]}, {}, "axis sort is null there"),
+        ({"slope": [1.0, 2.0], "kind": ["a", "b"]}, {}, r"axis slope is .* there, but \[1\.0, 2\.0\] here"),
         ({"slope": [1.0, 2.0, 3.0]}, {}, "axis kind is .* there, but null here"),
         ({"kind": ["a", "b"], "slope": [1.0, 2.0, 3.0]}, {}, "its axes have another order"),
         (None, {"seeds": 5}, r"seeds is \[1, 2, 3, 4\] there"),
         (None, {"scenario": moody}, "scenario is .*plane.*moody"),
     ],
 )
-def test_folder_of_another_sweep_is_refused(tmp_path, grid, options, message):
-    swept(tmp_path)
-    kept = (tmp_path / "runs.jsonl").read_bytes()
+def test_folder_of_another_sweep_is_refused(done, grid, options, message):
+    kept = (done[1] / "runs.jsonl").read_bytes()
     with pytest.raises(ValueError, match=f"holds another sweep .{message}.*choose another output folder"):
-        swept(tmp_path, grid, **options)
-    assert (tmp_path / "runs.jsonl").read_bytes() == kept
-
-
-def test_folder_of_other_code_is_refused(tmp_path):
-    swept(tmp_path)
-    description = json.loads((tmp_path / "sweep.json").read_text())
-    description["SHA-256 of the code"] = "0" * 64
-    (tmp_path / "sweep.json").write_text(json.dumps(description))
-    with pytest.raises(ValueError, match="SHA-256 of the code is"):
-        swept(tmp_path)
+        swept(done[1], grid, **options)
+    assert (done[1] / "runs.jsonl").read_bytes() == kept
 
 
 @pytest.mark.parametrize(("name", "text"), [("sweep.json", ""), ("sweep.json", "[1, 2]"), ("runs.jsonl", "")])
@@ -304,16 +248,12 @@ def test_exception_names_the_scenario_and_keeps_what_was_done(tmp_path):
         (3.0, "dict of figures by name"),
         ({1: 2.0}, "dict of figures by name"),
         ({"a": "b"}, "figure 'a' .* must be a number"),
+        ({"mood": 1.0}, "figure 'mood' has the name of an axis"),
     ],
 )
-def test_what_a_scenario_returns_is_checked(returned, message):
-    with pytest.raises(TypeError, match=message):
-        as_figures(returned)
-
-
-def test_figure_may_not_hide_an_axis(tmp_path):
-    with pytest.raises(ScenarioError, match="figure 'mood' has the name of an axis"):
-        swept(tmp_path, {"mood": ["good"]}, lambda scenario: {"mood": 1.0})
+def test_what_a_scenario_returns_is_checked(returned, message, tmp_path):
+    with pytest.raises(ScenarioError, match=message):
+        swept(tmp_path, {"mood": ["good"]}, lambda scenario: returned)
 
 
 def test_arguments_that_do_not_fit_are_refused(tmp_path):
@@ -351,9 +291,7 @@ def test_figure_shows_the_means_and_intervals():
 # The command line.
 
 
-@pytest.mark.parametrize(
-    "text", ["", "1,,2", "1:2", "1:2:1", "1:2:3:4", "a:b:3", "0:1:3:log", "-1:1:3:log", "1:inf:3", "1:2:3:log:1"]
-)
+@pytest.mark.parametrize("text", ["1,,2", "1:2", "1:2:1", "1:2:3:4", "a:b:3", "0:1:3:log", "1:inf:3"])
 def test_lists_refused(text):
     with pytest.raises(ValueError, match="axis must be values separated by commas, or first:last:count"):
         parsed_values(text, "axis")
@@ -375,35 +313,23 @@ def module(tmp_path, monkeypatch):
         yield "own_sweep_module:slope"
 
 
-def sweep_command(*arguments):
-    return main(["sweep", *arguments, "--jobs", "1", "--quiet"])
-
-
 def test_command_sweeps_a_function_of_ones_own(module, tmp_path, capsys):
-    arguments = ["--scenario", module, "--axis", "a=-1:1:3", "--axis", "side=left,right", "--seeds", "1,3"]
-    assert sweep_command(*arguments, "--output", "out") == 0
-    printed = capsys.readouterr().out
-    assert "12 runs, 0 of them diverged, 6 cells" in printed
+    arguments = ["sweep", "--scenario", module, "--axis", "a=-1:1:3", "--seeds", "1,3", "--jobs", "1", "--quiet"]
+    assert main([*arguments, "--axis", "side=left,right", "--output", "out"]) == 0
+    assert "12 runs, 0 of them diverged, 6 cells" in capsys.readouterr().out
     rows = read_csv(tmp_path / "out" / "cells.csv")
     assert [float(row["height_mean"]) for row in rows] == [-2.0, -2.0, 0.0, 0.0, 2.0, 2.0]
     assert (tmp_path / "out" / "figures" / "a.svg").exists()
-
-
-def test_command_names_the_scenario_that_failed(module, capsys):
-    assert sweep_command("--scenario", module, "--axis", "a=1", "--axis", "side=wrong", "--output", "out") == 1
-    assert (
-        "scenario a=1, side=wrong, seed=1: ValueError: no such side\nFinished runs are kept in out"
-        in capsys.readouterr().err
-    )
+    assert main([*arguments, "--axis", "side=wrong", "--output", "failed"]) == 1
+    said = capsys.readouterr().err
+    assert "scenario a=-1, side=wrong, seed=1: ValueError: no such side\nFinished runs are kept in failed" in said
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--algorithm", "KF-XYZ"], "algorithm must be one of"),
         (["--n-taps", "0"], "n_taps must be at least 1"),
         (["--n-taps", "64,"], "n_taps must be values separated by commas"),
-        (["--seeds", "0"], "seeds must be at least 1"),
         (["--axis", "a=1"], "no axis called a; there are path"),
         (["--scenario", "math", "--axis", "a=1"], "scenario must be a function"),
         (["--scenario", "math:no_such_function", "--axis", "a=1"], "'math' has no attribute 'no_such_function'"),

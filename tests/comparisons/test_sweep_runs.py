@@ -78,10 +78,12 @@ def plain_run(values, seed):
 
 
 @pytest.mark.parametrize(
-    "algorithm",
-    ["KF-ANC", "KF-OPC", "KF-OPC repaired", "KF-PB", "diagonal KF-OPC", "FxLMS", "FxNLMS", "MOV-FxLMS", "MOV-MFxLMS"],
+    ("algorithm", "amplifier"),
+    [
+        *(("KF-OPC", amplifier) for amplifier in ("linear", "hard clip", "soft")),
+        *((name, "hard clip") for name in ("KF-ANC", "KF-PB", "diagonal KF-OPC", "FxLMS", "MOV-FxLMS")),
+    ],
 )
-@pytest.mark.parametrize("amplifier", ["linear", "hard clip", "soft"])
 def test_runs_are_those_of_simulate(tmp_path, algorithm, amplifier):
     grid = {
         "algorithm": algorithm,
@@ -103,13 +105,6 @@ def test_runs_are_those_of_simulate(tmp_path, algorithm, amplifier):
         power = output_power(result.control_signal)
         assert run["output_power_db"] == pytest.approx(10 * math.log10(power), abs=1e-5)
         assert run["power_over_rated"] == pytest.approx(power / 10 ** (run["rated_power_db"] / 10), rel=1e-6)
-
-
-def test_an_algorithm_of_two_settings_is_tuned_in_both(tmp_path):
-    (run,) = swept(tmp_path, {"algorithm": "leaky FxLMS", "setting": "tuned"}, seeds=1).runs
-    scene = scene_of(scenario_of({}))
-    best = tune(Runs(), scene, ["leaky FxLMS"])["leaky FxLMS"].setting
-    assert (run["setting_used"], run["second_setting_used"]) == best
 
 
 def test_where_every_setting_diverges_the_run_counts_as_diverged():
@@ -163,37 +158,16 @@ def test_results_do_not_depend_on_what_runs_together():
         SMALL
         | {
             "algorithm": ["KF-ANC", "KF-OPC", "FxLMS", "KF-PB"],
-            "rated_power_db": list(range(-11, 0)),
+            "rated_power_db": [-11, -8, -5, -2],
             "amplifier": ["linear", "hard clip"],
         },
         1,
     )
     pending = dict(enumerate(grid.runs()))
     few, many = ({k: v for job in plan(pending, n) for k, v in do_job(job, None, 1).items()} for n in (1, 7))
-    assert len(few) == 88
+    assert len(few) == 32
     np.testing.assert_equal(few, many)  # to the last bit
     np.testing.assert_equal(few, {number: run_group([values], 1)[0] for number, values in pending.items()})
-
-
-def test_more_of_the_axes_change_what_they_should(tmp_path):
-    def power(**values):
-        (run,) = swept(tmp_path / str(values), values, seeds=1).runs
-        return run["power_over_rated"], run["noise_reduction_db"]
-
-    usual = power()
-    for change in (
-        {"noise": "tone"},
-        {"path": "band-pass"},
-        {"n_taps": 48},
-        {"duration_s": 1.0},
-        {"sensor_noise_db": -10.0},
-        {"path_gain_db": 6.0},
-        {"path_delay": 3},
-        {"path_phase_deg": 60.0},
-        {"setting": 1e-4},
-        {"rated_power_db": -3.0},
-    ):
-        assert power(**change) != usual, change
 
 
 def test_a_diverged_run_leaves_those_it_shares_gains_with_alone(tmp_path):
@@ -207,11 +181,15 @@ def test_a_diverged_run_leaves_those_it_shares_gains_with_alone(tmp_path):
 
 
 def test_setting_tuned_is_the_winner_of_the_studies_rule(tmp_path):
-    (run, other) = swept(tmp_path, {"algorithm": "FxLMS", "setting": "tuned", "noise": "tone"}).runs
     scene = scene_of(scenario_of({"noise": "tone"}))
+    tuned = {"setting": "tuned", "noise": "tone"}
+    (run, other) = swept(tmp_path / "one", {"algorithm": "FxLMS", **tuned}).runs
     assert run["setting_used"] == tune(Runs(), scene, ["FxLMS"])["FxLMS"].setting
     assert run["setting_used"] != middle("FxLMS")  # else this test says nothing
     assert other["setting_used"] == run["setting_used"]  # of the first seed, for all
+    (run,) = swept(tmp_path / "two", {"algorithm": "leaky FxLMS", **tuned}, seeds=1).runs
+    best = tune(Runs(), scene, ["leaky FxLMS"])["leaky FxLMS"].setting
+    assert (run["setting_used"], run["second_setting_used"]) == best
 
 
 @pytest.mark.parametrize("algorithm", ["KF-OPC", "FxLMS"])
@@ -278,22 +256,12 @@ def runs_of(axes, seeds):
     return dict(enumerate(built_in_grid(axes, seeds).runs()))
 
 
-def test_jobs_hold_each_run_once_and_only_what_shares():
-    pending = runs_of({"rated_power_db": list(range(-20, 0)), "algorithm": ["KF-ANC", "KF-OPC", "FxLMS"]}, 3)
-    jobs = plan(pending, 2)
-    assert sorted(number for job in jobs for number in job) == list(pending)
-    for job in jobs:
-        assert len({group_of(run) for run in job.values()}) == 1
-        assert len(job) <= min(most_together(run) for run in job.values())
-    # KF-ANC and KF-OPC of one noise: 40 runs of one gain sequence.
-    assert max(len(job) for job in jobs) == 40
-
-
-def test_one_gain_sequence_is_spread_over_all_cores():
+@pytest.mark.parametrize(("cores", "sizes"), [(1, [20]), (2, [10, 10]), (3, [7, 7, 6])])
+def test_one_gain_sequence_is_spread_over_all_cores(cores, sizes):
     pending = runs_of({"rated_power_db": list(range(-20, 0))}, 1)
-    assert [len(job) for job in plan(pending, 1)] == [20]
-    assert [len(job) for job in plan(pending, 2)] == [10, 10]
-    assert [len(job) for job in plan(pending, 3)] == [7, 7, 6]
+    jobs = plan(pending, cores)
+    assert [len(job) for job in jobs] == sizes
+    assert sorted(number for job in jobs for number in job) == list(pending)
 
 
 @pytest.mark.parametrize(
