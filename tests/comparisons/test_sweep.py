@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 import shutil
 from contextlib import chdir
@@ -215,6 +216,13 @@ def test_folder_of_another_sweep_is_refused(done, grid, options, message):
     with pytest.raises(ValueError, match=f"holds another sweep .{message}.*choose another output folder"):
         swept(done[1], grid, **options)
     assert (done[1] / "runs.jsonl").read_bytes() == kept
+
+
+def test_folder_of_other_code_is_refused(done):
+    description = json.loads((done[1] / "sweep.json").read_text())
+    (done[1] / "sweep.json").write_text(json.dumps(description | {"SHA-256 of the code": "0" * 64}))
+    with pytest.raises(ValueError, match="SHA-256 of the code is"):
+        swept(done[1])
 
 
 @pytest.mark.parametrize(("name", "text"), [("sweep.json", ""), ("sweep.json", "[1, 2]"), ("runs.jsonl", "")])
