@@ -12,13 +12,12 @@ from datetime import date
 import jsonschema
 import numpy as np
 import pytest
-import soundfile
 from scipy.signal import firwin, welch
 
-from kfopc_filterpy import __version__, noise_reduction_db
+from kfopc_filterpy import __version__
 from kfopc_filterpy.bench import algorithms, assess, compare_recordings
 from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA, advice_on
-from kfopc_filterpy.metrics import convergence_time_s, overshoot
+from kfopc_filterpy.metrics import convergence_time_s
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
 from kfopc_filterpy.signals import Recording, band_limited_noise
 
@@ -156,16 +155,6 @@ def test_a_tone_is_predicted_so_that_a_late_loudspeaker_does_not_limit():
     assert verdict.enough
 
 
-def test_the_run_keeps_the_rating_and_the_figures_are_those_of_the_run():
-    verdict = verdict_on("amplifier", better=False)
-    run = verdict.runs["KF-PB"]
-    assert overshoot(run.control_signal, 0.1, FS, window_s=0.1) <= 1 + 1e-12
-    assert verdict.noise_reduction_db == noise_reduction_db(run.error, run.disturbance)
-    figures = verdict.figures["KF-PB"]
-    assert figures["worst_window"] <= 1 + 1e-12
-    assert figures["output_power"] == pytest.approx(0.1 * figures["of_rated_power"])
-
-
 class Bar:
     """A progress bar that keeps how far it moved."""
 
@@ -278,28 +267,20 @@ def test_the_json_is_strict_and_as_its_schema_says(written):
 
 
 def test_the_page_says_where_it_comes_from_and_no_watts_that_are_not_known(tmp_path):
-    options: dict = {"fs": FS, "n_taps": TAPS, "beside": (), "want_db": 1.0}
-    known, unknown = (
-        assess(
-            noise(), arriving(20), arriving(6, length=16), rating=AmplifierRating(8.0, 2.0, volts_per_unit=v), **options
-        )
-        for v in (4.0, None)
-    )
+    known, unknown = (on(rating=AmplifierRating(8.0, 2.0, volts_per_unit=volts), want_db=1.0) for volts in (4.0, None))
     named = replace(unknown, origin={"Files": "<a>.wav, 24000 samples"})
     pages = [verdict.write(tmp_path).read_text(encoding="utf-8") for verdict in (known, named)]
     assert known.limits.rated_power == unknown.limits.rated_power / 16 == 1.0
     assert "with 2 W into 8 ohm" in known.verdict
-    assert "Power (W into 8 ohm)" in pages[0]
-    assert ">4 V<" in pages[0]
-    assert not re.search(r"\d W\b|\(W", re.sub(r"data:[^\"]*", "", pages[1]))
-    for told in (
-        "not watts: volts_per_unit is not known",
-        "not known, taken as 1 V",
-        "&lt;a&gt;.wav, 24000 samples",
-    ):
-        assert told in pages[1]
-    for told in (f"kfopc_filterpy {__version__}", str(date.today()), "8000 Hz", "in a run of 2.7 s"):
+    for told in ("Power (W into 8 ohm)", ">4 V<", f"kfopc_filterpy {__version__}", str(date.today()), "8000 Hz"):
         assert told in pages[0]
+    assert not re.search(r"\d W\b|\(W", re.sub(r"data:[^\"]*", "", pages[1]))
+    for told in ("not watts: volts_per_unit is not known", "&lt;a&gt;.wav, 24000 samples"):
+        assert told in pages[1]
+    for text in pages:
+        assert not re.search(r'(?:href|src)="(?:https?:)?//', text)
+        assert all(source.startswith("data:") for source in re.findall(r'src="([^"]{0,40})', text))
+        assert all((tmp_path / stem).is_file() for stem in re.findall(r'href="([^"#]+)"', text))
 
 
 @pytest.mark.parametrize(
@@ -315,29 +296,6 @@ def test_a_controller_that_did_better_is_chosen_or_the_verdict_says_why_not(rati
     reached = {name: figures["noise_reduction_db"] for name, figures in verdict.figures.items()}
     assert reached[other] > reached[algorithm] + 0.1
     assert any(note.startswith(f"{other}, as published, reaches {reached[other]:.1f} {why}") for note in verdict.notes)
-
-
-def test_the_page_needs_no_other_file_and_says_the_verdict(written):
-    verdict, page = written
-    text = page.read_text(encoding="utf-8")
-    sources = re.findall(r'src="([^"]{0,40})', text)
-    assert len(sources) >= 9  # five figures, four sounds
-    assert all(source.startswith("data:") for source in sources)
-    assert not re.search(r'(?:href|src)="(?:https?:)?//', text)
-    assert verdict.verdict in text
-    assert text.index(verdict.verdict) < text.index("<li>noise lasts only 3 s") < text.index("<figure")
-    for stem in re.findall(r'href="([^"#]+)"', text):
-        assert (page.parent / stem).is_file()
-
-
-def test_the_sounds_have_one_level(written):
-    verdict, page = written
-    run = verdict.runs["KF-PB"]
-    before, fs = soundfile.read(page.parent / "audio" / "verdict-before.wav")
-    after, _ = soundfile.read(page.parent / "audio" / "verdict-after.wav")
-    assert fs == FS
-    ratio = np.sum(run.disturbance**2) / np.sum(run.error**2)
-    assert np.sum(before**2) / np.sum(after**2) == pytest.approx(ratio, rel=1e-3)  # 16 bits
 
 
 def test_the_levels_are_those_of_the_sounds(written):
@@ -372,25 +330,21 @@ def test_a_third_octave_that_the_control_makes_louder_is_noted():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"noise": np.zeros(8000)}, "noise must not be silent"),
         ({"noise": np.ones(8000)}, "noise must not be silent"),
         ({"secondary": np.zeros(8)}, "secondary must not be silent: every value is 0; record it again"),
         ({"primary": None}, "primary must be given unless there is a disturbance"),
         ({"disturbance": noise()}, "channel 0 of disturbance is channel 0 of noise, sample for sample"),
         ({"disturbance": np.ones(7)}, "disturbance must have 24000 values, got 7"),
-        ({"noise": np.full(8000, np.nan)}, "noise must be finite"),
         (
             {"noise": noise()[:16000].reshape(2, 8000)},
             "primary must be (K microphones, I references, taps) = (1, 2, taps)",
         ),
         ({"noise": Recording(noise(), 2 * FS)}, f"noise is sampled at {2 * FS} Hz but fs is {FS} Hz"),
-        ({"disturbance": Recording(noise(), 2 * FS)}, f"disturbance is sampled at {2 * FS} Hz but fs is {FS} Hz"),
         ({"rating": 0.0}, "rating must be greater than 0"),
         ({"algorithm": "KF"}, "algorithm must be one of 'KF-PB', 'KF-OPC', 'FxLMS'"),
         ({"want_db": -1.0}, "want_db must not be negative"),
         ({"switch_on_s": 3.0}, "switch_on_s must be within the 3 s"),
         ({"switch_on_s": 1.1}, "noise must last 2 s after the control is switched on, got 1.9 s"),
-        ({"noise": noise()[:2400]}, "noise must last 2 s after the control is switched on, got 0.27 s"),
         ({"n_taps": 12000}, "must have at least"),
         ({"pascal_per_unit": 0.0}, "pascal_per_unit must be greater than 0"),
     ],

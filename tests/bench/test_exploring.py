@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 
 import numpy as np
 import pytest
@@ -109,17 +108,6 @@ def test_a_diverged_run_says_when():
     assert re.fullmatch(r"KF-ANC diverged \d\.\d{3} s after it was switched on\.", result.summary)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_run_takes_less_than_a_second(algorithm):
-    explore(BAND_PASS, ExploreSettings(algorithm=algorithm))  # compiles
-    taken = []
-    for level in (1.0, 2.0, 3.0):
-        start = time.perf_counter()
-        explore(BAND_PASS, ExploreSettings(algorithm=algorithm, level_db=level))
-        taken.append(time.perf_counter() - start)
-    assert min(taken) < 1.0  # on a core that other work shares
-
-
 def test_the_measured_duct_is_there_with_its_two_recordings(shared_data, data_folder):
     data_folder(shared_data)
     setups = {setup.name: setup for setup in explore_setups()}
@@ -167,34 +155,21 @@ def test_files_are_taken_in_their_own_units_and_at_one_rate(files):
 
 
 @pytest.mark.parametrize(
-    ("noise", "message"),
-    [(np.ones(7999), "must last 1 s at least, got 1 s"), (np.zeros(8000), "silent"), ([np.nan] * 8000, "noise")],
-    ids=["short", "silent", "NaN"],
-)
-def test_recordings_that_cannot_be_used_are_refused(noise, message):
-    with pytest.raises(ValueError, match=message):
-        AcousticSetup("mine", [0, 1.0], [1.0], 8000, noise)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
+    ("make", "message"),
     [
-        ({"algorithm": "KF"}, "algorithm must be"),
-        ({"rating_db": np.inf}, "rating_db"),
-        ({"path_error_samples": -1.0}, "path_error_samples"),
-        ({"state_noise": 0.0}, "state_noise"),
+        (lambda: AcousticSetup("mine", [0, 1.0], [1.0], 8000, np.ones(7999)), "must last 1 s at least, got 1 s"),
+        (lambda: AcousticSetup("mine", [0, 1.0], [1.0], 8000, np.zeros(8000)), "silent"),
+        (lambda: ExploreSettings(algorithm="KF"), "algorithm must be"),
+        (lambda: ExploreSettings(rating_db=np.inf), "rating_db"),
+        (lambda: ExploreSettings(path_error_samples=-1.0), "path_error_samples"),
+        (lambda: ExploreSettings(state_noise=0.0), "state_noise"),
+        (lambda: explore(BAND_PASS, ExploreSettings(band=(200.0, 9000.0))), "band"),
+        (
+            lambda: explore(AcousticSetup("mean", [0, 0, 1.0], [0, 1.0], 8000, np.ones(8000))),
+            "silent from 200 to 2000 Hz: choose a wider band",
+        ),
     ],
-    ids=["algorithm", "rating", "path error", "state noise"],
 )
-def test_settings_out_of_range_are_refused(settings, message):
+def test_what_cannot_be_computed_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
-        ExploreSettings(**settings)
-
-
-def test_a_band_that_the_recording_or_the_sample_rate_lacks_is_refused():
-    hum = AcousticSetup("hum", [0, 0, 1.0], [0, 1.0], 8000, np.sin(2 * np.pi * 100 * np.arange(8000) / 8000))
-    with pytest.raises(ValueError, match="band"):
-        explore(hum, ExploreSettings(band=(200.0, 5000.0)))
-    zeros_above = AcousticSetup("mean", [0, 0, 1.0], [0, 1.0], 8000, np.ones(8000))
-    with pytest.raises(ValueError, match="silent from 200 to 2000 Hz: choose a wider band"):
-        explore(zeros_above)
+        make()

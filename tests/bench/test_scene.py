@@ -7,10 +7,8 @@ import pytest
 from helpers.channels import dense_systems, random_paths, through
 
 from kfopc_filterpy.bench import Scene, Trial, algorithms, best_setting, make_controller, make_scene, run_setting
-from kfopc_filterpy.signals import tone
 
 FS = 16000.0
-KALMAN = ["KF-ANC", "KF-OPC", "KF-OPC repaired"]
 
 
 def scene_of(n_taps: int, seeds: tuple[int, ...] = (3,)):
@@ -42,20 +40,15 @@ def test_initial_variance_makes_weights_that_need_the_wiener_power(n_taps):
     assert scene.unconstrained_power == 4.0 * 0.5
 
 
-@pytest.mark.parametrize("name", KALMAN)
-def test_kalman_filters_start_with_the_variances_of_the_scene(name):
+def test_filters_start_with_the_variances_of_the_scene():
     scene = scene_of(16)
-    controller = make_controller(scene, name, 1e-6)
+    controller = make_controller(scene, "KF-OPC", 1e-6)
     np.testing.assert_array_equal(np.diag(controller.covariance), np.full(16, scene.initial_variance))
     assert controller.measurement_noise == scene.measurement_noise
     assert controller.state_noise == pytest.approx(1e-6 * scene.measurement_noise / scene.filtered_power, rel=1e-12)
-
-
-def test_recursive_least_squares_start_with_the_same_variance_over_q():
-    scene = scene_of(16)
-    controller = make_controller(scene, "FxRLS", 1e-3)
-    ratio = scene.initial_variance / scene.measurement_noise
-    np.testing.assert_allclose(np.diag(controller.covariance), ratio * controller.measurement_noise, rtol=1e-12)
+    least_squares = make_controller(scene, "FxRLS", 1e-3)
+    ratio = scene.initial_variance / scene.measurement_noise * least_squares.measurement_noise
+    np.testing.assert_allclose(np.diag(least_squares.covariance), ratio, rtol=1e-12)
 
 
 def test_each_seed_has_its_own_sensor_noise_apart_from_the_noises():
@@ -80,13 +73,6 @@ def test_runs_together_hear_the_sensor_noise_of_their_seed():
         np.testing.assert_allclose(together.error, alone.error, atol=1e-9)
     assert len(set(scene.sensor_noise_seeds)) == 2
     assert not set(scene.sensor_noise_seeds) & set(scene.seeds)
-
-
-def test_seeds_of_one_scene_are_scaled_alike():
-    noises = {seed: tone(400.0, 0.5, fs=FS, amplitude=float(seed)) for seed in (1, 2, 3)}
-    scene = make_scene(noises, [0.0, 1.0], [1.0], fs=FS, rated_power=1.0, power_multiple=2.0, n_taps=8, switch_on_s=0.1)
-    # Not quite 2: the Wiener solution is of the record after switch-on, the power of the whole record.
-    assert [np.mean(x**2) for x in scene.references] == pytest.approx([2.0] * 3, rel=2e-3)
 
 
 # ---- Several channels
@@ -162,31 +148,18 @@ def test_budget_is_kept_if_every_loudspeaker_keeps_its_own(channels):
     [
         ({"rated_power": [-1.0, 2.0]}, "rated_power must be"),
         ({"rated_power": np.ones(3)}, "one for each of the 2 loudspeakers"),
-        ({"rated_power": 0.0}, "rated_power must be"),
+        ({"primary": [0.0, 1.0], "secondary": [1.0], "rated_power": np.ones(2)}, "rated_power"),
         ({"primary": np.ones((3, 1, 20))}, "I = 2 of reference"),
         ({"switch_on_s": 1.0}, "longer than switch_on_s"),
     ],
-    ids=["negative", "three", "zero", "one reference", "short"],
+    ids=["negative", "three", "two of one", "one reference", "short"],
 )
 def test_channels_that_do_not_fit_are_refused(changed, match):
-    settings = {
-        "primary": random_paths(3, 2, 20, seed=1),
-        "secondary": random_paths(3, 2, 12, seed=2),
-        "fs": FS,
-        "rated_power": 1.0,
-        "power_multiple": 3.0,
-        "n_taps": 8,
-        "switch_on_s": 0.1,
-    }
-    with pytest.raises(ValueError, match=match):
-        make_scene({0: np.random.default_rng(0).standard_normal((2, 4000))}, **settings | changed)
-
-
-def test_one_channel_has_one_rated_power():
-    with pytest.raises((TypeError, ValueError), match="rated_power"):
-        make_scene(
-            {0: tone(400.0, 1.0, fs=FS)}, [0.0, 1.0], [1.0], fs=FS, rated_power=np.ones(2), power_multiple=1.0, n_taps=4
-        )
+    paths = {"primary": random_paths(3, 2, 20, seed=1), "secondary": random_paths(3, 2, 12, seed=2)}
+    settings = {"fs": FS, "rated_power": 1.0, "power_multiple": 3.0, "n_taps": 8, "switch_on_s": 0.1}
+    x = np.random.default_rng(0).standard_normal((2, 4000))
+    with pytest.raises((TypeError, ValueError), match=match):
+        make_scene({0: x[0] if "secondary" in changed else x}, **paths | settings | changed)
 
 
 def test_an_algorithm_of_one_channel_is_refused_by_name(channels):
