@@ -119,14 +119,6 @@ def test_tuning_two_settings_follows_the_rule(scene: Scene) -> None:
     assert kept[best.setting] == min(kept.values())
 
 
-def test_refining_goes_on_from_trials_made_before(scene: Scene) -> None:
-    settings: list[Any] = [(0.05, 0.1), (0.05, 10.0)]
-    trials = try_settings(Runs(), scene, {"MOV-FxLMS fixed": settings})["MOV-FxLMS fixed"]
-    best = tune(Runs(), scene, ["MOV-FxLMS fixed"], trials={"MOV-FxLMS fixed": trials})["MOV-FxLMS fixed"]
-    assert best.trials[:2] == trials
-    assert len(best.trials) == 2 + 30
-
-
 class RefusingScene(Scene):
     """A scene in which every filter refuses to go on."""
 

@@ -10,11 +10,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 import kfopc_filterpy
-from kfopc_filterpy import KFOPC
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 sys.path[:0] = [str(DOCS), str(DOCS / "extensions")]
@@ -249,34 +247,3 @@ def test_the_reader_of_cells_finds_those_that_draw():
     hidden = "```{code-cell} python\n:tags: [remove-cell]\nplot_nse(run)\n```"
     computed = "```{code-cell} python\nfrom kfopc_filterpy.plot import plot_nse\n```"
     assert drawing_cells(f"{computed}\n\n{drawn}\n\n{hidden}") == [drawn]
-
-
-# The theory.
-
-
-def test_the_covariance_of_the_state_prediction_error_is_P():
-    """Eq. 3: what P(n|n-1) says of the error, against the errors of many random walks that were drawn by eq. 1.
-
-    Tolerances are five standard deviations: of the mean of a chi-square variable over its degrees of freedom, and of an
-    element of a sample covariance of Gaussians, sqrt((P_ii P_jj + P_ij^2) / M).
-    """
-    n_taps, n_walks, n_samples, r, q, p0 = 3, 1200, 25, 0.03, 0.4, 0.8
-    rng = np.random.default_rng(11)
-    x = np.convolve(rng.standard_normal(n_samples + n_taps), [1.0, 0.9], mode="same")
-    errors, P = np.empty((n_walks, n_samples, n_taps)), np.empty((n_samples, n_taps, n_taps))
-    for walk in range(n_walks):
-        kf = KFOPC.random_walk(n_taps, state_noise=r, measurement_noise=q, initial_variance=p0)
-        w = np.sqrt(p0) * rng.standard_normal(n_taps)
-        for n in range(n_samples):
-            w = w + np.sqrt(r) * rng.standard_normal(n_taps)
-            row = x[n : n + n_taps][::-1]
-            kf.predict()
-            errors[walk, n], P[n] = w - kf.x_prior[:, 0], kf.P_prior
-            kf.update(row @ w + np.sqrt(q) * rng.standard_normal(), H=row)
-    normalised = np.einsum("mni,nij,mnj->n", errors, np.linalg.inv(P), errors) / (n_walks * n_taps)
-    assert np.all(np.abs(normalised - 1) < 5 * np.sqrt(2 / (n_taps * n_walks)))
-    sampled = np.einsum("mni,mnj->nij", errors, errors) / n_walks
-    diagonal = np.einsum("nii->ni", P)
-    scatter = np.sqrt((diagonal[:, :, None] * diagonal[:, None, :] + P**2) / n_walks)
-    assert np.all(np.abs(sampled - P) < 5 * scatter)
-    assert np.abs(P[-1, 0, 1]) > 10 * scatter[-1, 0, 1]  # the elements off the diagonal were put to the test too

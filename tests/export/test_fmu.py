@@ -9,9 +9,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from helpers.c99 import WARNINGS, compiler, succeeds
+from helpers.c99 import WARNINGS
 from helpers.channels import random_paths
-from helpers.core import tool, zig
+from helpers.core import compiler, ran, tool, zig
 
 from kfopc_filterpy import FxLMS, OutputLimiter, OutputPowerConstraint, kf_opc, kf_pb, simulate
 from kfopc_filterpy.export import Float32Controller, export_fmu
@@ -191,7 +191,7 @@ def test_the_sources_compile_as_their_description_says(command, opened, tmp_path
     described = ElementTree.parse(f"{sources}/buildDescription.xml").find(".//SourceFileSet")
     files = [f"{sources}/{one.get('name')}" for one in described]
     flags = [*described.get("compilerOptions").replace("-O3", "-O0").split(), *WARNINGS, "-fPIC", "-shared"]
-    succeeds(compiler(command), *flags, *files, "-lm", "-o", f"{unit.folder}/binaries/x86_64-linux/anc.so")
+    ran(compiler(command), *flags, *files, "-lm", "-o", f"{unit.folder}/binaries/x86_64-linux/anc.so")
     unit.slave.freeInstance()
     unit.slave = unit.opened()
     expected = run(Float32Controller(CONTROLLERS["KF-PB"]()), True, 300)
@@ -238,7 +238,7 @@ def test_the_library_for_windows_has_the_bits_of_python(opened, tmp_path):
     wine, unit = tool("wine", "wine"), opened()
     host, sources = tmp_path / "host.c", f"{unit.folder}/sources"
     host.write_text(HOST)
-    succeeds(*zig(), "-target", "x86_64-windows-gnu", "-I", sources, host, "-o", tmp_path / "host.exe")
+    ran(*zig(), "-target", "x86_64-windows-gnu", "-I", sources, host, "-o", tmp_path / "host.exe")
     result = run(CONTROLLERS["KF-OPC"]())
     stream = np.stack([result.reference, np.r_[0.0, result.error[:-1]]], axis=1)
     library = f"{unit.folder}/binaries/x86_64-windows/anc.dll"

@@ -3,38 +3,18 @@
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pytest
 
+from helpers.core import c_compiler, ran
 from kfopc_filterpy.export import CExport, export_c
 
 STREAM = Path(__file__).resolve().parents[1] / "export" / "stream.c"
 WARNINGS = ("-Wall", "-Wextra", "-pedantic", "-Werror", "-Wconversion")
 FAST = ("-O0",)  # the compiler takes most of the time
-
-
-def compiler(*names: str) -> str:
-    """Return the first of these compilers that the machine has, or skip the test."""
-    found = next((name for name in names if shutil.which(name)), None)
-    if found is None:
-        pytest.skip(f"needs a compiler: none of {', '.join(names)} is installed")
-    return found
-
-
-def c_compiler() -> str:
-    """Return the C compiler, or skip the test."""
-    return compiler("cc", "gcc", "clang")
-
-
-def succeeds(*command: Any) -> None:
-    """Run a command; if it fails, so does the test, with what the command said."""
-    done = subprocess.run([str(part) for part in command], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 class Outputs(NamedTuple):
@@ -60,7 +40,7 @@ class Program:
         path: Any = (0.0,),
         command: str | None = None,
     ) -> None:
-        self.command = c_compiler() if command is None else command
+        self.command = c_compiler()[0] if command is None else command
         self.exported: CExport = export_c(controller, folder / "anc.c", dtype=dtype)
         self.program = folder / "stream"
         number = "double" if dtype == "float64" else "float"
@@ -75,7 +55,7 @@ class Program:
         assert stated
         of_gcc = () if "clang" in self.command else ("-Wdouble-promotion",)  # clang's also warns of literals
         flags = (*stated[1].split(), *WARNINGS, *of_gcc, *options, *self.defined, "-I", self.exported.path.parent)
-        succeeds(self.command, *flags, STREAM, self.exported.path, "-lm", "-o", self.program)
+        ran(self.command, *flags, STREAM, self.exported.path, "-lm", "-o", self.program)
 
     def run(self, x: np.ndarray, e: np.ndarray) -> Outputs:
         """Run it on references, (I, n) or (n,), and errors, (K, n) or (n,)."""

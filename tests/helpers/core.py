@@ -61,12 +61,17 @@ def known() -> list[str]:
     return list(ALGORITHMS)
 
 
+def compiler(*names: str) -> str:
+    """Return the first of these compilers that the machine has, or skip the test."""
+    found = next((path for name in names if (path := shutil.which(name))), None)
+    if found is None:
+        pytest.skip(f"needs a compiler: none of {', '.join(names)} is installed")
+    return found
+
+
 def c_compiler() -> list[str]:
     """Return the machine's C compiler, or skip the test."""
-    found = next((path for name in ("cc", "gcc", "clang") if (path := shutil.which(name))), None)
-    if found is None:
-        pytest.skip("needs a C compiler: cc, gcc or clang")
-    return [found]
+    return [compiler("cc", "gcc", "clang")]
 
 
 def zig() -> list[str]:

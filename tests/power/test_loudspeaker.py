@@ -123,9 +123,8 @@ def test_a_path_is_identified_within_the_limit_only() -> None:
     ("changed", "error", "match"),
     [
         *(
-            ({name: bad}, ValueError, f"{name} must be greater than 0")
+            ({name: 0.0}, ValueError, f"{name} must be greater than 0")
             for name in ("fs", "resonance_hz", "q_ts", "x_max_mm", "mm_per_volt", "volts_per_unit", "sharpness")
-            for bad in (0.0, -1.0)
         ),
         ({"q_ts": "0.5"}, TypeError, "q_ts must be a single number"),
         ({"resonance_hz": 8000.0}, ValueError, "resonance_hz must be below fs/2 = 8000 Hz, got 8000 Hz"),
