@@ -249,18 +249,11 @@ def test_a_port_in_use_is_named():
             serve_explore(port=port)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"port": -1}, "port must be at least 0"),
-        ({"port": 65536}, "at most 65535"),
-        ({"setups": []}, "setups must not be empty"),
-    ],
-    ids=["negative", "too large", "no setups"],
-)
-def test_wrong_arguments_are_refused_before_anything_is_served(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        serve_explore(**arguments)
+def test_wrong_arguments_are_refused_before_anything_is_served():
+    with pytest.raises(ValueError, match="at most 65535"):
+        serve_explore(port=65536)
+    with pytest.raises(ValueError, match="setups must not be empty"):
+        serve_explore(setups=[])
 
 
 def test_the_server_listens_on_this_machine_only(address):

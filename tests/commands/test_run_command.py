@@ -17,11 +17,17 @@ PRIMARY[[70, 75, 82]] = 1.0, 0.5, -0.3
 X = np.random.default_rng(5).standard_normal(8 * FS)
 
 
+def plant(folder, **changes):
+    """Write the files of a plant, and return the options that name them."""
+    signals = {"noise": 0.1 * X, "P": PRIMARY, "S": S} | changes
+    for name, signal in signals.items():
+        write_wav(folder / f"{name}.wav", signal, FS)
+    noise, primary, secondary = (str(folder / f"{name}.wav") for name in signals)
+    return [noise, "--primary", primary, "--secondary", secondary]
+
+
 def test_the_command_shows_levels_and_returns_what_ended_it(command, tmp_path):
-    write_wav(tmp_path / "noise.wav", 0.1 * X, FS)
-    write_wav(tmp_path / "P.wav", PRIMARY, FS)
-    write_wav(tmp_path / "S.wav", S, FS)
-    given = [str(tmp_path / "noise.wav"), "--primary", str(tmp_path / "P.wav"), "--secondary", str(tmp_path / "S.wav")]
+    given = plant(tmp_path)
     options = ["--rated-power", "0.03", "--taps", "24", "--block", "32", "--identify", "1.5", "--listen", "1"]
     code, out, err = command("run", *given, *options, "--seconds", "6")
     assert code == 0
@@ -35,7 +41,6 @@ def test_the_command_shows_levels_and_returns_what_ended_it(command, tmp_path):
     assert "5.5 s of control are left of the 6 s asked for" in err
     assert re.search(r"5\.0 s +reduction +[1-9]\d\.\d dB +power [\d.e-]+ \(\d+ %\) +load", err)
     for wrong, message in (
-        ([given[0], *options], "--secondary is needed"),
         (options, "a recording with --primary and --secondary is needed"),
         ([*given[:3], *options], "--secondary is needed"),
         ([*given, *options, "--latency", "3"], "latency must be at least a block, 32 samples, got 3"),
@@ -58,9 +63,7 @@ def test_the_command_says_if_its_blocks_make_the_anti_noise_late(command, tmp_pa
     """With one tap of the primary path, an eighth of the noise's power, within the reach of blocks of 40 samples."""
     primary = np.zeros(130)
     primary[[70, 125]] = 1.0, 1.0
-    for name, signal in (("noise", 0.1 * X), ("P", primary), ("S", S)):
-        write_wav(tmp_path / f"{name}.wav", signal, FS)
-    given = [str(tmp_path / "noise.wav"), "--primary", str(tmp_path / "P.wav"), "--secondary", str(tmp_path / "S.wav")]
+    given = plant(tmp_path, P=primary)
     options = ["--rated-power", "0.03", "--taps", "48", "--identify", "1.5", "--listen", "1", "--quiet"]
     code, out, err = command("run", *given, *options, "--block", "40", "--seconds", "1")
     assert code == 0
@@ -94,10 +97,9 @@ def test_the_error_microphone_can_be_a_reference(command, tmp_path, source):
 def test_a_plant_of_several_channels_is_simulated(command, tmp_path):
     paths = np.zeros((2, 2, 4))
     paths[:, :, 1] = [[0.9, 0.2], [0.1, 0.8]]
-    write_wav(tmp_path / "noise.wav", 0.1 * X[: 5 * FS], FS)
-    write_wav(tmp_path / "P.wav", np.stack((PRIMARY, np.roll(0.7 * PRIMARY, 3))), FS)
+    given = plant(tmp_path, noise=0.1 * X[: 5 * FS], P=np.stack((PRIMARY, np.roll(0.7 * PRIMARY, 3))))
     np.save(tmp_path / "S.npy", paths)
-    given = [str(tmp_path / "noise.wav"), "--primary", str(tmp_path / "P.wav"), "--secondary", str(tmp_path / "S.npy")]
+    given[-1] = str(tmp_path / "S.npy")
     options = ["--rated-power", "0.03", "--taps", "24", "--block", "32", "--identify", "1.5", "--listen", "0.5"]
     code, out, err = command("run", *given, *options, "--file-fs", str(FS), "--quiet")
     assert code == 0, err

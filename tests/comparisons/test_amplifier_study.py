@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.studies import run_study, short_duct, smaller
+from helpers.studies import plain_run, run_study, short_duct, smaller
 
 from comparisons.studies import amplifier, cases
 from comparisons.studies.amplifier import KNOWN, UNKNOWN, AmplifierRow, saturating
 from comparisons.studies.cases import Case
-from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier, noise_reduction_db, simulate
-from kfopc_filterpy.bench import Claim, make_controller
+from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier, noise_reduction_db
+from kfopc_filterpy.bench import Claim
 from kfopc_filterpy.metrics import harmonics_db
 
 FS = 16000.0
@@ -41,19 +41,8 @@ def test_a_row_is_that_of_a_plain_run(small: Any, algorithm: str, known: str) ->
     )
     driven = saturating(scene, Case("duct", "tone", "hard clip"), 10.0, known)
     clip = HardClipAmplifier(np.sqrt(2 * 0.1))  # 10 dB below the unconstrained power of 1
-    result = simulate(
-        make_controller(driven, algorithm, row["setting"], amplifier=clip if known == KNOWN else None),
-        scene.references[0],
-        disturbance=scene.disturbances[0],
-        secondary_path=scene.secondary,
-        fs=FS,
-        amplifier=clip,
-        rated_power=0.1,
-        sensor_noise_std=scene.sensor_noise_std,
-        rng=1000,
-        switch_on_s=0.5,
-        record_weights_every=160,
-    )
+    amplifiers = {"amplifier": clip, "known": clip if known == KNOWN else None}
+    result = plain_run(driven, algorithm, row["setting"], rated_power=0.1, record_weights_every=160, **amplifiers)
     assert result.weights is not None
     assert row["noise_reduction_db"] == pytest.approx(noise_reduction_db(result.error, result.disturbance), abs=1e-9)
     assert row["harmonics_db"] == pytest.approx(harmonics_db(result.error, result.disturbance, 300.0, FS), abs=1e-6)

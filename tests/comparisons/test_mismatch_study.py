@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.studies import run_study, short_duct, smaller
+from helpers.studies import plain_run, run_study, short_duct, smaller
 
 from comparisons.studies import cases, mismatch
 from comparisons.studies.cases import Case
 from comparisons.studies.mismatch import EXACT, WRONG, MismatchRow, case_scene
 from kfopc_filterpy import FxLMS, noise_reduction_db, output_power, simulate
-from kfopc_filterpy.bench import Claim, make_controller
+from kfopc_filterpy.bench import Claim
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.signals import tone
 
@@ -41,16 +41,7 @@ def test_rows_are_those_of_plain_runs(small: Any, algorithm: str) -> None:
     (row,) = (r for r in report.extra["rows"] if r["algorithm"] == algorithm and _is(r, "tone", "phase", 45.0, EXACT))
     estimate = path_taps(perturbed_path(scene.secondary, fs=16000.0, phase_deg=45.0))
     wrong = replace(scene, secondary_estimate=estimate)
-    result = simulate(
-        make_controller(wrong, algorithm, row["setting"]),
-        scene.references[0],
-        disturbance=scene.disturbances[0],
-        secondary_path=scene.secondary,
-        fs=16000.0,
-        sensor_noise_std=scene.sensor_noise_std,
-        rng=1000,
-        switch_on_s=0.5,
-    )
+    result = plain_run(wrong, algorithm, row["setting"])
     # Kalman filters run together add in another order.
     assert row["noise_reduction_db"] == pytest.approx(noise_reduction_db(result.error, result.disturbance), abs=1e-6)
     assert row["power"] == pytest.approx(output_power(result.control_signal) / scene.rated_power, rel=1e-6)

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from helpers.studies import smaller
+from helpers.studies import plain_run, smaller
 
 from comparisons.__main__ import main
 from comparisons.studies.cases import FS, SWITCH_ON_S, make_case, measured_data, noises, paths
@@ -24,9 +24,8 @@ from kfopc_filterpy import (
     noise_reduction_db,
     output_power,
     power_constrained_wiener,
-    simulate,
 )
-from kfopc_filterpy.bench import AllDivergedError, Runs, Scene, algorithms, make_controller, tune
+from kfopc_filterpy.bench import AllDivergedError, Runs, Scene, algorithms, tune
 from kfopc_filterpy.paths import path_taps, perturbed_path
 
 SMALL = {"duration_s": 0.5, "n_taps": 24}
@@ -46,35 +45,18 @@ def middle(algorithm):
     return settings[len(settings) // 2]
 
 
-def plain_run(values, seed):
-    """The scenario as a user would write it, with `simulate`."""
-    scene = make_case(
-        paths()[values["path"]],
-        noises()[values["noise"]](values["duration_s"] + SWITCH_ON_S, seed),
-        n_taps=values["n_taps"],
-        sensor_noise_db=values["sensor_noise_db"],
-        seed=seed,
-    )
+def of_simulate(values, seed):
+    """The scenario as a user would write it."""
+    noise = noises()[values["noise"]](values["duration_s"] + SWITCH_ON_S, seed)
+    about = {name: values[name] for name in ("n_taps", "sensor_noise_db")}
+    scene = make_case(paths()[values["path"]], noise, seed=seed, **about)
     rated = 10 ** (values["rated_power_db"] / 10)
     errors = {"gain_db": values["path_gain_db"], "delay_samples": values["path_delay"]}
     estimate = path_taps(perturbed_path(scene.secondary, fs=FS, phase_deg=values["path_phase_deg"], **errors))
     limit = math.sqrt(2 * rated) * 10 ** (values["amplifier_limit_db"] / 20)
-    amplifier = {"linear": None, "hard clip": HardClipAmplifier(limit), "soft": SoftSaturationAmplifier(limit)}
-    controller = make_controller(
-        replace(scene, secondary=estimate, rated_power=rated), values["algorithm"], values["setting"]
-    )
-    return simulate(
-        controller,
-        scene.references[0],
-        disturbance=scene.disturbances[0],
-        secondary_path=scene.secondary,
-        fs=FS,
-        amplifier=amplifier[values["amplifier"]],
-        rated_power=1.0,
-        sensor_noise_std=scene.sensor_noise_std,
-        rng=1000 + seed,
-        switch_on_s=SWITCH_ON_S,
-    )
+    amplifiers = {"linear": None, "hard clip": HardClipAmplifier(limit), "soft": SoftSaturationAmplifier(limit)}
+    scene = replace(scene, secondary_estimate=estimate, rated_power=rated)
+    return plain_run(scene, values["algorithm"], values["setting"], amplifier=amplifiers[values["amplifier"]])
 
 
 @pytest.mark.parametrize(
@@ -101,7 +83,7 @@ def test_runs_are_those_of_simulate(tmp_path, algorithm, amplifier):
     sweep = swept(tmp_path, grid)
     assert len(sweep.runs) == 4
     for run in sweep.runs:
-        result = plain_run(run, run["seed"])
+        result = of_simulate(run, run["seed"])
         # Sharing gains changes the order of sums only; over 8000 samples that grows to less than 1e-8 of the figures.
         expected = noise_reduction_db(result.error, result.disturbance)
         assert run["noise_reduction_db"] == pytest.approx(expected, rel=1e-6, abs=1e-6)

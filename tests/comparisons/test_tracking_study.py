@@ -6,14 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.studies import run_study, short_duct, smaller
+from helpers.studies import plain_run, run_study, short_duct, smaller
 
 from comparisons.studies import cases, tracking
 from comparisons.studies import tracking_events as events
 from comparisons.studies.tracking import TrackingRow
 from comparisons.studies.tracking_events import CHIRP_HZ, SWEEP_S, Event, change_scene, jump_scene, sweep
-from kfopc_filterpy import convergence_time_s, noise_reduction_db, simulate
-from kfopc_filterpy.bench import make_controller
+from kfopc_filterpy import convergence_time_s, noise_reduction_db
 from kfopc_filterpy.metrics import overshoot
 
 FS = 16000.0
@@ -37,19 +36,7 @@ def small() -> Any:
 def test_a_row_is_that_of_plain_runs(small: Any, algorithm: str) -> None:
     report, scenes = small
     (row,) = (r for r in report.extra["rows"] if (r["event"], r["algorithm"]) == ("sign", algorithm))
-    results = [
-        simulate(
-            make_controller(scene, algorithm, row["setting"]),
-            scene.references[0],
-            disturbance=scene.disturbances[0],
-            secondary_path=scene.secondary,
-            fs=FS,
-            sensor_noise_std=scene.sensor_noise_std,
-            rng=1000 + seed,
-            switch_on_s=0.5,
-        )
-        for scene, seed in zip(scenes, (1, 2), strict=True)
-    ]
+    results = [plain_run(scene, algorithm, row["setting"]) for scene in scenes]
     e, d, y = (np.array([getattr(r, name) for r in results]) for name in ("error", "disturbance", "control_signal"))
     rated = scenes[0].rated_power
     after = slice(round(0.5 * FS), round(1.2 * FS))

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from comparisons.studies import cases
-from kfopc_filterpy.bench import Runs, StudyReport
+from kfopc_filterpy import SimulationResult, simulate
+from kfopc_filterpy.bench import Runs, Scene, StudyReport, make_controller
 from kfopc_filterpy.bench.registry import REGISTRY
 
 
@@ -46,6 +47,14 @@ def run_study(study: Any) -> StudyReport:
     report = study.main(runs)
     assert runs.done == study.planned_runs() > 0
     return report
+
+
+def plain_run(scene: Scene, algorithm: str, setting: Any, *, known: Any = None, **options: Any) -> SimulationResult:
+    """Run a scene's first seed as a user would; `known` is an amplifier that the controller knows."""
+    made = make_controller(scene, algorithm, setting, amplifier=known)
+    plant = {"disturbance": scene.disturbances[0], "secondary_path": scene.secondary, "fs": scene.fs}
+    noise = {"sensor_noise_std": scene.sensor_noise_std, "rng": 1000 + scene.seeds[0]}
+    return simulate(made, scene.references[0], switch_on_s=scene.switch_on_s, **plant, **noise, **options)
 
 
 def short_duct() -> dict[str, cases.Pair]:
