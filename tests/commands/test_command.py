@@ -34,10 +34,8 @@ def test_the_version_is_printed(command):
 @pytest.mark.parametrize(
     ("words", "completed"),
     [
-        (["ver"], ["verdict"]),
-        (["verdict", "--pri"], ["--primary"]),
         (["data", "fe"], ["fetch"]),
-        (["verdict", "--primary", "P"], ["P.wav"]),
+        (["verdict", "--pri"], ["--primary"]),
         (["paths", "resample", "S"], ["S.wav", "S16.wav"]),
     ],
 )

@@ -27,22 +27,6 @@ def test_a_path_is_identified_from_a_recording(command, folder, tmp_path):
     np.testing.assert_allclose(found, taps, atol=1e-4)
 
 
-def test_a_path_is_identified_from_the_two_channels_of_one_recording(command, folder, tmp_path):
-    sent = np.random.default_rng(0).standard_normal(2 * FS)
-    write_wav(folder / "loop.wav", [sent, 0.5 * np.roll(sent, 20) - 0.2 * np.roll(sent, 24)], FS)
-    ends = ["--taps", 32, "-o", tmp_path / "S.npy"]
-    assert command("paths", "identify", "loop.wav:0", "loop.wav:1", *ends)[0] == 0
-    # The recording begins with a few samples of its end, which 32 taps of 16000 samples hardly notice.
-    np.testing.assert_allclose(np.load(tmp_path / "S.npy"), 0.5 * np.eye(32)[20] - 0.2 * np.eye(32)[24], atol=2e-3)
-
-
-def test_a_file_without_a_rate_is_resampled_from_the_one_that_is_given(command, tmp_path):
-    rates = ["--file-fs", 2 * FS, "--fs", FS]
-    assert command("paths", "resample", "untimed.npy", tmp_path / "S.wav", *rates)[0] == 0
-    taps, fs = soundfile.read(tmp_path / "S.wav")
-    assert (fs, int(np.argmax(taps))) == (FS, 6)  # 12 samples at twice the rate
-
-
 def test_files_that_a_path_does_not_explain_are_refused_and_nothing_is_written(command, folder, tmp_path):
     write_wav(folder / "other.wav", band_limited_noise((100, 1500), 3.0, fs=FS, rng=2), FS)
     code, out, err = command("paths", "identify", "noise.wav", "other.wav", "--taps", 24, "-o", tmp_path / "S.wav")
@@ -75,13 +59,6 @@ def test_a_recording_given_as_a_path_is_analysed_with_a_warning(command, folder)
         "kfopc paths inspect: warning: long.wav lasts 8 s, too long for an impulse response: is it a recording?" in err
     )
     assert command("paths", "inspect", "S.wav")[2] == ""
-
-
-def test_a_written_path_may_be_named_by_an_option(command, tmp_path):
-    for action, more in (("convert", []), ("resample", ["--fs", FS])):
-        output = tmp_path / f"{action}.npy"
-        assert command("paths", action, "S.wav", "-o", output, *more)[0] == 0
-        np.testing.assert_array_equal(np.load(output), np.eye(64)[12])
 
 
 @pytest.mark.parametrize("suffix", ["wav", "npy", "csv", "txt"])

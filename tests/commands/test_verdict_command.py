@@ -66,13 +66,6 @@ def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(tmp_path, m
     assert "S.wav would be overwritten: choose another folder" in capsys.readouterr().err
 
 
-def test_watts_without_volts_are_not_stated_and_the_terminal_says_why(command):
-    _, out, err = command("verdict", *SCENE, "--watt", "1", "--ohm", "8", "--taps", "16", "--algorithm", "FxLMS")
-    assert "with a rated power of 8," in out
-    assert " W" not in out
-    assert "not watts: volts_per_unit is not known, and taken as 1 V" in err
-
-
 def test_a_process_ends_with_1_if_it_is_not_and_reads_its_standard_input(folder):
     scene = ["-", *SCENE[1:], "--rated-power", "0.05", "--taps", "32", "--json", "--quiet"]
     ended = process(folder, "verdict", *scene, standard_input=(folder / "noise.wav").read_bytes())
@@ -243,18 +236,6 @@ def test_several_channels_are_read_in_the_order_that_the_help_states(command, se
     assert data["bound_db"] == pytest.approx(verdict.bound_db, abs=1e-3)
     assert data["noise_reduction_db"] == pytest.approx(verdict.noise_reduction_db, abs=0.05)
     assert data["unlimited_power"] == pytest.approx(verdict.unlimited_power.tolist(), rel=1e-3)
-
-
-def test_the_exit_code_is_that_of_all_amplifiers_together(command, several):
-    files = ["noise.wav", "--disturbance", "errors.wav", "--secondary", "S1.wav", "--secondary", "S2.wav"]
-    options = ["--ohm", 8, "--volts-per-unit", 1, "--taps", 32, "--quiet", "--algorithm", "KF-PB"]
-    code, out, _ = command("verdict", *files, "--watt", 1, *options)
-    assert code == 0
-    assert out.startswith("Enough: KF-PB reaches")
-    code, out, _ = command("verdict", *files, "--watt", 1, "--watt", 0.0001, *options)
-    assert code == 1
-    assert "1, 0.0001 W into 8 ohm" in out
-    assert "The amplifier limits" in out
 
 
 def test_without_a_reference_microphone_the_noise_is_that_of_the_ear(command, folder, tmp_path):

@@ -135,23 +135,6 @@ def arguments(function: Any) -> list[str]:
     return [name for name in inspect.signature(function).parameters if name not in ("self", "cls")]
 
 
-def test_the_reader_of_docstrings_finds_what_is_described_and_only_that():
-    doc = """Summary with other.
-
-    Parameters
-    ----------
-    a, b : float
-        Not c.
-    **more
-        Rest.
-
-    Returns
-    -------
-    d : float
-    """
-    assert described(doc) == {"a", "b", "more"}
-
-
 def test_every_argument_of_a_public_name_is_described_in_its_docstring():
     for name, thing in PUBLIC:
         if inspect.isclass(thing) and (issubclass(thing, BUILT_OTHERWISE) or getattr(thing, "_is_protocol", False)):

@@ -39,14 +39,6 @@ def test_soft_saturation_is_rapps_formula(ratio, limit, sharpness):
     assert SoftSaturationAmplifier(limit, sharpness)(y) == pytest.approx(expected, rel=1e-13, abs=1e-300)
 
 
-@given(signals, signals, limits, sharpnesses)
-def test_every_model_rises_and_never_amplifies(a, b, limit, sharpness):
-    low, high = sorted((a, b))
-    for amplifier in make(limit, sharpness):
-        assert amplifier(low) <= amplifier(high) + 1e-12 * abs(amplifier(high))  # pow is right to an ulp or two
-        assert abs(amplifier(a)) <= abs(a)
-
-
 @pytest.mark.parametrize("sharpness", [0.5, 2.0, 50.0, 400.0])
 def test_soft_saturation_far_above_its_limit_is_the_limit(sharpness):
     # the power in Rapp's formula overflows from a ratio of 1e6 on at sharpness 26: the output must not become 0
