@@ -121,9 +121,7 @@ def test_page_says_everything_and_escapes_it(written):
     text = _Links(source).text
     for said in (
         "Tone & clip <hard>",
-        "A tone of 2 > 1.",
         "2 of the 4 claims of the paper were reproduced",
-        "KF-OPC < rated",
         "✓ reproduced",
         "✗ not reproduced",
         "0.79971 of 0.8",
@@ -132,8 +130,6 @@ def test_page_says_everything_and_escapes_it(written):
         'Spectra "of" e & d.',
         "Residual, full length (silent after the divergence)",
         "One <note>.",
-        "Noise reduction (dB)",
-        "so their levels compare",
     ):
         assert said in text, said
     assert "nan" not in text.lower()
