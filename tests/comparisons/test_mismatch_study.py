@@ -19,7 +19,7 @@ from kfopc_filterpy.signals import tone
 
 TAPS = 16
 STUDIED = ("KF-ANC", "KF-OPC", "KF-PB", "FxLMS", "MOV-FxLMS")
-AMOUNTS = {"phase": (0.0, 45.0), "gain": (-6.0, 0.0), "delay": (0.0,)}
+AMOUNTS = {"phase": (0.0, 45.0, 120.0), "gain": (-6.0, 0.0), "delay": (0.0,)}
 
 
 @pytest.fixture(scope="module")

@@ -7,20 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.studies import few_settings, run_study, smaller
+from helpers.channels import through
+from helpers.studies import few_settings, plain_run, run_study, smaller
 
 from comparisons.studies import multichannel
 from comparisons.studies import multichannel_rooms as rooms
 from comparisons.studies.multichannel import BOUND, KF_PB, SCALED, ChannelRow, claims
 from comparisons.studies.multichannel_rooms import MEASURED, Place, level_map_db
-from kfopc_filterpy import noise_reduction_db, output_power, simulate
-from kfopc_filterpy.bench import Runs, algorithms, make_controller
+from kfopc_filterpy import noise_reduction_db, output_power
+from kfopc_filterpy.bench import Runs, algorithms
 
 KEPT = ("KF-PB", "FxLMS", "MOV-FxLMS", "clipping FxLMS", "leaky FxLMS")
-
-
-def through(paths: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return np.array([[np.convolve(p, x)[: x.size] for p in row] for row in paths]).sum(axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -44,19 +41,10 @@ def test_rows_are_what_a_run_by_hand_gives(small: Any) -> None:
     rows = {(row["algorithm"], row["noise"], row["rating"]): row for row in report.extra["rows"]}
     scene = rooms.make_rated_scene(place, "band noise", 2.0)
     x = scene.references[0]
-    np.testing.assert_allclose(scene.disturbances[0], through(place.primary, x[0]), atol=1e-12 * np.abs(x).max())
+    np.testing.assert_allclose(scene.disturbances[0], through(place.primary, x), atol=1e-12 * np.abs(x).max())
     for name in (KF_PB, "FxLMS"):
         row = rows[name, "band noise", "a quarter each"]
-        result = simulate(
-            make_controller(scene, name, row["setting"]),
-            x,
-            primary_path=place.primary,
-            secondary_path=place.secondary,
-            fs=place.fs,
-            switch_on_s=scene.switch_on_s,
-            sensor_noise_std=scene.sensor_noise_std,
-            rng=scene.sensor_noise_seeds[0],
-        )
+        result = plain_run(scene, name, row["setting"])
         assert row["noise_reduction_db"] == pytest.approx(
             noise_reduction_db(result.error, result.disturbance), abs=1e-6
         )
@@ -85,8 +73,8 @@ def test_level_map_is_the_sound_at_its_points() -> None:
         after, _ = level_map_db(2, x, result)
     point = room.at([[along[4], across[1], rooms.HEIGHT_M]])
     n = int(rooms.FS)
-    quiet = through(point.primary, x[0])[0]
-    played = quiet - sum(np.convolve(point.secondary[0, j], y[j])[: y.shape[1]] for j in range(2))
+    quiet = through(point.primary, x)[0]
+    played = quiet - through(point.secondary, y)[0]
     levels = [10 * np.log10(np.mean(sound[-n:] ** 2)) for sound in (quiet, played)]
     assert after[1, 4] - before[1, 4] == pytest.approx(levels[1] - levels[0], abs=1e-9)
     assert 10 * np.log10(np.mean(10 ** (before / 10))) == pytest.approx(0.0, abs=1e-9)
