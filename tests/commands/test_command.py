@@ -51,73 +51,72 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
     assert sorted(ran.stdout.split()) == completed, ran.stderr
 
 
-V = f"verdict {' '.join(SCENE)}"
-P = "verdict noise.wav --secondary S.wav --rated-power 1"
+PATHS = "--primary P.wav --secondary S.wav"
 ERRORS = {
     "verdict": "the following arguments are required: noise, --secondary; see kfopc verdict --help",
     "verdikt": "invalid choice",
     "paths convert S.wav S.csv --bogus 3": "unrecognized arguments: --bogus 3; see kfopc paths convert",
     # Ratings.
-    f"{V}": "a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6",
-    f"{V} --watt 20": "need --ohm",
-    f"{V} --watt 20 --ohm 8 --rated-power 1": "leave out one of them",
-    f"{V} --watt twenty --ohm 8": "--watt must be a single number in W, got 'twenty'",
-    f"{V} --watt -20 --ohm 8": "--watt must be greater than 0 W, got -20; see kfopc verdict --help",
-    f"{V} --loudspeaker-watt 1": "a loudspeaker's rating needs --ohm",
-    f"{V} --rated-power 1 --ohm 8 --x-max-mm 1": "--x-max-mm and --displacement must be",
-    f"{V} --ohm 8 --loudspeaker-watt 1 --programme-watt 2": "leave out one of them",
-    f"{V} --ohm 8 --loudspeaker-watt 1 --impedance falling.csv": "of falling.csv must",
-    "compare noise.wav --primary P.wav --secondary S.wav --rated-power 1 --ohm -1": "--ohm must be greater than 0",
+    "verdict noise.wav PATHS": "a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6",
+    "verdict noise.wav PATHS --watt 20": "need --ohm",
+    "verdict noise.wav PATHS --watt 20 --ohm 8 --rated-power 1": "leave out one of them",
+    "verdict noise.wav PATHS --watt twenty --ohm 8": "--watt must be a single number in W, got 'twenty'",
+    "verdict noise.wav PATHS --watt -20 --ohm 8": "--watt must be greater than 0 W, got -20; see kfopc verdict --help",
+    "verdict noise.wav PATHS --loudspeaker-watt 1": "a loudspeaker's rating needs --ohm",
+    "verdict noise.wav PATHS --rated-power 1 --ohm 8 --x-max-mm 1": "--x-max-mm and --displacement must be",
+    "verdict noise.wav PATHS --ohm 8 --loudspeaker-watt 1 --programme-watt 2": "leave out one of them",
+    "verdict noise.wav PATHS --ohm 8 --loudspeaker-watt 1 --impedance falling.csv": "of falling.csv must",
+    "compare noise.wav PATHS --rated-power 1 --ohm -1": "--ohm must be greater than 0",
     # The option that an argument of the package comes from is named.
-    f"{V} --rated-power 1 --algorithm KF": "--algorithm must be one of 'KF-PB'",
-    f"{V} --rated-power 1 --want-db -3": "--want-db must not be negative",
-    f"{V} --rated-power 1 --taps 4.5": "--taps must be a whole number, got '4.5'",
-    f"{V} --rated-power 1 --memory 0": "--memory must be greater than 0 s, got 0",
-    f"{V} --rated-power 1 --path-error-samples -1": "--path-error-samples must not be",
-    f"{V} --rated-power 1 --path-error-db 30": "--path-error-db must be at most 20, got 30",
-    f"{V} --rated-power 1 --pascal-per-unit 1 --pascal-per-unit 1": "--pascal-per-unit must be given once, or once for each",
-    f"{V} --rated-power 1 -o noise.wav": "noise.wav is a file: name a folder",
+    "verdict noise.wav PATHS --rated-power 1 --algorithm KF": "--algorithm must be one of 'KF-PB'",
+    "verdict noise.wav PATHS --rated-power 1 --want-db -3": "--want-db must not be negative",
+    "verdict noise.wav PATHS --rated-power 1 --taps 4.5": "--taps must be a whole number, got '4.5'",
+    "verdict noise.wav PATHS --rated-power 1 --memory 0": "--memory must be greater than 0 s, got 0",
+    "verdict noise.wav PATHS --rated-power 1 --path-error-samples -1": "--path-error-samples must not be",
+    "verdict noise.wav PATHS --rated-power 1 --path-error-db 30": "--path-error-db must be at most 20, got 30",
+    "verdict noise.wav PATHS --rated-power 1 --pascal-per-unit 1 --pascal-per-unit 1": "--pascal-per-unit must be given once",
+    "verdict noise.wav PATHS --rated-power 1 -o noise.wav": "noise.wav is a file: name a folder",
     "explore --port -1": "--port must be at least 0, got -1",
     # Files.
     "verdict noise.wav --secondary S.wav --rated-power 1": "--primary or --disturbance is needed",
-    f"{V.replace('noise', 'empty')} --rated-power 1": "empty.wav",
-    f"{V.replace('noise', 'text')} --rated-power 1": "cannot be read as an audio file",
-    f"{V.replace('S.wav', 'silent.wav')} --rated-power 1": "silent.wav must not be silent",
-    f"{V.replace('P.wav', 'noise.wav')} --rated-power 1": "noise.wav 24000 (3 s): an impulse response must be shorter",
-    f"{P} --disturbance short.wav": "short.wav has 20000 samples, noise.wav 24000: they must be recorded together",
-    "paths identify noise.wav d.wav --taps 20000 -o x.npy": "--taps must be at most 12000 for recordings of 24000 samples",
+    "verdict empty.wav PATHS --rated-power 1": "empty.wav",
+    "verdict text.wav PATHS --rated-power 1": "cannot be read as an audio file",
+    "verdict noise.wav --primary P.wav --secondary silent.wav --rated-power 1": "silent.wav must not be silent",
+    "verdict noise.wav --primary noise.wav --secondary S.wav --rated-power 1": "an impulse response must be shorter",
+    "verdict noise.wav --secondary S.wav --rated-power 1 --disturbance short.wav": "they must be recorded together",
+    "paths identify noise.wav d.wav --taps 20000 -o x.npy": "--taps must be at most 12000",
     "paths inspect S.wav --primary silent.wav": "silent.wav must not be silent",
     "paths convert S.wav": "S.wav -o S.csv",
     "paths convert S.wav S.xyz": "must end in .wav, .npy, .csv, .txt",
     "paths resample S.wav x.wav --fs 8000.5": "take another --fs, or write .csv",
     # Sampling rates.
-    f"{V.replace('S.wav', 'S16.wav')} --rated-power 1": "for example with --fs 16000",
-    f"{V} --rated-power 1 --fs -1": "--fs must be greater than 0 Hz, got -1",
+    "verdict noise.wav --primary P.wav --secondary S16.wav --rated-power 1": "for example with --fs 16000",
+    "verdict noise.wav PATHS --rated-power 1 --fs -1": "--fs must be greater than 0 Hz, got -1",
     "explore noise.wav --primary P.wav --secondary untimed.npy": "untimed.npy states no sampling",
     "paths convert S.wav x.npy --file-fs 8000": "--file-fs is for files that state no rate",
     "paths resample untimed.npy x.wav --fs 8000": "for example with --file-fs 48000",
     # Channels.
-    f"{V.replace('noise', 'stereo')} --rated-power 1": "choose a channel, as in stereo.wav:0",
-    f"{V.replace('noise', 'stereo')} --rated-power 1 --channel 2": "verdict: --channel must be below the 2",
-    f"{P} --disturbance stereo.wav:1": "channel 0 of stereo.wav:1 is channel 0 of noise.wav, sample for sample",
-    f"{P.replace('noise', 'stereo')} --disturbance ./stereo.wav:1": "channel 0 of ./stereo.wav:1 is channel 0 of stereo.wav, sample for",
+    "verdict stereo.wav PATHS --rated-power 1": "choose a channel, as in stereo.wav:0",
+    "verdict stereo.wav PATHS --rated-power 1 --channel 2": "verdict: --channel must be below the 2",
+    "verdict noise.wav --secondary S.wav --rated-power 1 --disturbance stereo.wav:1": "is channel 0 of noise.wav",
+    "verdict stereo.wav --secondary S.wav --rated-power 1 --disturbance ./stereo.wav:1": "is channel 0 of stereo.wav",
     "paths convert stereo.wav x.npy": "name one of stereo.wav:0 to stereo.wav:1",
     "paths convert S.wav:1 x.npy": "the channel in S.wav:1 must be below the 1 channel(s) of S.wav:1",
     "paths convert S.wav:0:1 x.npy": "S.wav:0:1 does not exist",
     "paths convert S.wav:S x.npy": "S.wav is an audio file, which has no named variables",
-    "paths identify stereo.wav stereo.wav --channel 0 --taps 8 -o x.npy": "sample for sample: is it the error microphone? Name its",
+    "paths identify stereo.wav stereo.wav --channel 0 --taps 8 -o x.npy": "sample for sample: is it the error microphone?",
     # An option that nothing uses.
-    f"{V} --watt 20 --ohm 8 --impedance no-such.csv": "--impedance would not be used",
-    f"{V} --rated-power 1 --ohm 8 --volts-per-unit 2": "--ohm and --volts-per-unit would not be used",
-    f"{V} --rated-power 1 --rating sine": "--rating would not be used",
-    f"{V} --rated-power 1 --ohm 8 --loudspeaker-watt 5 --impedance rising.csv": "--ohm would not be used",
-    "run --references 0 --errors 1 --rated-power 1 --file-fs 8000 --channel 0": "--file-fs and --channel would not be used",
+    "verdict noise.wav PATHS --watt 20 --ohm 8 --impedance no-such.csv": "--impedance would not be used",
+    "verdict noise.wav PATHS --rated-power 1 --ohm 8 --volts-per-unit 2": "--ohm and --volts-per-unit would",
+    "verdict noise.wav PATHS --rated-power 1 --rating sine": "--rating would not be used",
+    "verdict noise.wav PATHS --rated-power 1 --ohm 8 --loudspeaker-watt 5 --impedance rising.csv": "--ohm would not",
+    "run --references 0 --errors 1 --rated-power 1 --file-fs 8000 --channel 0": "--file-fs and --channel would not",
 }
 
 
 @pytest.mark.parametrize("arguments", ERRORS, ids=lambda arguments: arguments.replace("/", ""))
 def test_an_error_is_one_line_that_says_what_to_do(command, arguments):
-    code, out, err = command(*arguments.split())
+    code, out, err = command(*arguments.replace("PATHS", PATHS).split())
     assert (code, out) == (2, "")
     assert ERRORS[arguments] in err
     assert err.count("\n") == 1
