@@ -74,7 +74,7 @@ ERRORS = {
     "verdict noise.wav PATHS --rated-power 1 --memory 0": "--memory must be greater than 0 s, got 0",
     "verdict noise.wav PATHS --rated-power 1 --path-error-samples -1": "--path-error-samples must not be",
     "verdict noise.wav PATHS --rated-power 1 --path-error-db 30": "--path-error-db must be at most 20, got 30",
-    "verdict noise.wav PATHS --rated-power 1 --pascal-per-unit 1 --pascal-per-unit 1": "--pascal-per-unit must be given once",
+    "verdict noise.wav PATHS --rated-power 1 --pascal-per-unit 1 --pascal-per-unit 1": "must be given once",
     "verdict noise.wav PATHS --rated-power 1 -o noise.wav": "noise.wav is a file: name a folder",
     "explore --port -1": "--port must be at least 0, got -1",
     # Files.

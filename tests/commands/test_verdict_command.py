@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import scipy.io
 import soundfile
-from helpers.commands import FS, SCENE, process
+from helpers.commands import FS, ROOT, SCENE, process
 
 from kfopc_filterpy import bench
 from kfopc_filterpy.bench import assess
@@ -24,8 +24,6 @@ from kfopc_filterpy.commands import main
 from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.signals import band_limited_noise, read_recording, write_wav
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_a_process_ends_with_0_if_the_amplifier_is_enough_and_writes_what_it_says(folder, tmp_path):

@@ -22,7 +22,7 @@ STUDIED = ("KF-ANC", "FxLMS", "KF-OPC", "KF-PB", "clipping FxLMS")
 
 @pytest.fixture(scope="module")
 def small() -> Any:
-    """Few taps, little more than a second, one pair of paths cut short, two overdrives, hard clip on a tone and a band noise."""
+    """Few taps, a short run, one pair of paths cut short, two overdrives, hard clip on a tone and a band noise."""
     short = short_duct()
     studied = [Case("duct", "tone", "hard clip"), Case("duct", "band noise", "soft saturation")]
     constants = {"ALGORITHMS": STUDIED, "OVERDRIVES_DB": (0.0, 10.0), "DURATION_S": 1.1}
