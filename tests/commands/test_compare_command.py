@@ -60,3 +60,10 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_read(acti
     code, _, err = command(action, "missing.wav", *SCENE[1:], "--rated-power", 1, "-o", "noise.wav/out")
     assert code == 2
     assert "'noise.wav/out' cannot be written" in err
+
+
+def test_an_algorithm_of_one_channel_is_not_compared_with_several(command, several):
+    files = ["noise.wav", "--primary", "P1.wav", "--secondary", "S1.wav", "--rated-power", 1]
+    code, _, err = command("compare", *files, "--algorithm", "KF-OPC repaired", "--quiet")
+    assert code == 2
+    assert "--algorithm must be one of" in err
