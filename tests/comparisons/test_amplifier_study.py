@@ -9,10 +9,10 @@ import pytest
 from helpers.studies import plain_run, run_study, short_duct, smaller
 
 from comparisons.studies import amplifier, cases
-from comparisons.studies.amplifier import KNOWN, UNKNOWN, AmplifierRow, saturating
+from comparisons.studies.amplifier import KNOWN, UNKNOWN, AmplifierRow, saturating, settings_for
 from comparisons.studies.cases import Case
 from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier, noise_reduction_db
-from kfopc_filterpy.bench import Claim
+from kfopc_filterpy.bench import Claim, make_controller
 from kfopc_filterpy.metrics import harmonics_db
 
 FS = 16000.0
@@ -59,6 +59,15 @@ def test_known_amplifiers_reach_those_that_can_know_them(small: Any) -> None:
     assert driven.amplifier.limit == pytest.approx(np.sqrt(2 * 10**-0.6))
     assert saturating(scene, case, 6.0, UNKNOWN).known_amplifier is None
     assert amplifier.knowing() == ["KF-ANC", "KF-OPC", "KF-PB", "MOV-FxLMS"]
+
+
+def test_peak_limits_go_up_to_the_amplifiers(small: Any) -> None:
+    driven = saturating(small[1], Case("duct", "tone", "hard clip"), 10.0, UNKNOWN)
+    limits = {
+        round(make_controller(driven, "clipping FxLMS", setting).amplitude_limit, 9)
+        for setting in settings_for(driven, ("clipping FxLMS",))["clipping FxLMS"]
+    }
+    assert limits == {round(driven.amplitude_limit, 9), round(float(np.sqrt(driven.rated_power)), 9)}
 
 
 # ---- Claims from rows made by hand

@@ -14,7 +14,7 @@ from comparisons.studies import multichannel
 from comparisons.studies import multichannel_rooms as rooms
 from comparisons.studies.multichannel import BOUND, KF_PB, SCALED, ChannelRow, claims
 from comparisons.studies.multichannel_rooms import MEASURED, Place, level_map_db
-from kfopc_filterpy import noise_reduction_db, output_power
+from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener
 from kfopc_filterpy.bench import Runs, algorithms
 
 KEPT = ("KF-PB", "FxLMS", "MOV-FxLMS", "clipping FxLMS", "leaky FxLMS")
@@ -60,6 +60,23 @@ def test_ratings_are_a_quarter_of_what_each_would_like(small: Any) -> None:
     assert np.ptp(quarter.rated_power) > 0.0
 
 
+def test_bound_is_that_of_the_steady_half(small: Any) -> None:
+    report, place = small
+    scene = rooms.make_rated_scene(place, "compressor", 2.0)
+    bound = power_constrained_wiener(
+        scene.references[0],
+        scene.disturbances[0],
+        place.secondary,
+        place.n_taps,
+        scene.rated_power,
+        fs=place.fs,
+        segment_s=2.0,
+        switch_on_s=scene.switch_on_s,
+    )
+    row = next(row for row in report.extra["rows"] if row["algorithm"] == BOUND and row["noise"] == "compressor")
+    assert row["noise_reduction_db"] == pytest.approx(bound.noise_reduction_over(1.0)["whole"], abs=1e-6)
+
+
 def test_level_map_is_the_sound_at_its_points() -> None:
     """Against paths to one point of the plane, computed and convolved on their own."""
     pytest.importorskip("pyroomacoustics")
@@ -85,6 +102,14 @@ def test_without_rooms_the_study_says_so() -> None:
         report = multichannel.main(Runs())
     assert isinstance(report, str)
     assert "pyroomacoustics" in report
+
+
+def test_direct_forms_run_in_small_systems_only() -> None:
+    big = Place("8 x 8", 4000.0, 128, np.zeros((8, 1, 256)), np.zeros((8, 8, 256)), {})
+    small = Place("2 x 2", 4000.0, 128, np.zeros((2, 1, 256)), np.zeros((2, 2, 256)), {})
+    direct = set(multichannel.DIRECT) & set(algorithms(several_channels=True))
+    assert direct <= set(multichannel.names(small))
+    assert not direct & set(multichannel.names(big))
 
 
 # ---- Claims

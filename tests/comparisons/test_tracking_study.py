@@ -91,6 +91,15 @@ def test_a_jump_is_of_the_reference(pair: Any) -> None:
     assert scene.rated_power == pytest.approx(10**-0.3)
 
 
+def test_events_say_where_they_happen() -> None:
+    found = {event.name: event for event in events.all_events()}
+    assert list(found) == ["20 dB louder", "20 dB softer", "sign", "delay", "longer duct", "one sweep", "sweeps"]
+    assert found["longer duct"].paths == ("duct",)
+    names = [(event.name, path) for event, path in events.jobs({"duct": None, "measured duct": None})]
+    assert len(names) == 13
+    assert ("longer duct", "measured duct") not in names
+
+
 def test_an_algorithm_without_a_setting_is_lost() -> None:
     event = Event("sign", lambda pair, seed: None, {"changed": (0.0, 1.0)})  # type: ignore[arg-type,return-value]
     row, course = tracking.run_event(event, "duct", [], {"FxLMS": None}, "FxLMS")
