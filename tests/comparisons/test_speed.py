@@ -78,6 +78,11 @@ def test_real_time_taps_are_the_most_that_are_done_before_the_next_sample():
     assert speed.real_time_taps(rows, "a", 2e6) is None
 
 
+def test_a_filter_that_is_not_installed_is_left_out():
+    with smaller(speed, find_spec=lambda name: None):
+        assert set(speed.chosen_variants(64)) == {*speed_variants.OURS, "numpy rank-1", "filterpy"}
+
+
 def test_speed_without_its_extra_says_what_to_install(tmp_path, capsys):
     with smaller(command, find_spec=lambda name: None), pytest.raises(SystemExit):
         main(["speed", "--output", str(tmp_path)])

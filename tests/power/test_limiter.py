@@ -309,8 +309,11 @@ def test_the_rating_scales_everything() -> None:
         assert (limiter(100, factor**2).process(factor * u) / factor).tobytes() == expected.tobytes()
 
 
-def test_the_window_is_in_seconds() -> None:
+def test_settings_can_be_read_and_the_window_is_in_seconds() -> None:
     with_default = OutputLimiter(1.0)
+    with pytest.raises(AttributeError):
+        with_default.rated_power = 3.0  # type: ignore[misc]
+    assert with_default.rated_power == 1.0  # past outputs were limited to it
     assert (with_default.fs, with_default.window_s, with_default.amplitude_limit) == (16000.0, 0.1, None)
     assert with_default.state.laps.shape[1] - 1 == 1600
     assert OutputLimiter(1.0, fs=48000, window_s=0.02).state.laps.shape[1] - 1 == 960
