@@ -6,20 +6,11 @@ import re
 
 import numpy as np
 import pytest
-from helpers.files import FS, WRITERS, rew_text, signal, write_sofa, write_uff
+from helpers.files import FS, rew_text, write_sofa, write_uff
 
 from kfopc_filterpy.paths import frequency_response, path_taps, read_path, resample_path
 from kfopc_filterpy.paths.duct import Duct, duct_paths
 from kfopc_filterpy.signals import read_recording, write_wav
-
-
-@pytest.mark.parametrize("name", [name for name in WRITERS if name not in ("x.npy", "x.csv", "x.sofa")])
-def test_a_path_is_read_as_it_was_written(name, tmp_path):
-    WRITERS[name](tmp_path / name)
-    path = read_path(tmp_path / name)
-    expected = signal(2) if path.samples.ndim == 2 else signal()
-    np.testing.assert_allclose(path.samples, expected, rtol=0, atol=1e-11 if name.endswith("uff") else 0)
-    assert (path.fs, path.file_fs, path.name) == (FS, FS, name)
 
 
 def test_a_path_at_another_rate_keeps_its_response_and_a_recording_its_height(tmp_path):

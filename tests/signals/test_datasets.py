@@ -20,17 +20,17 @@ from kfopc_filterpy.signals import (
 )
 
 FILES = {
-    "duct/Pz1.mat": ("Pz1", 1024),
-    "duct/Sz.mat": ("S", 512),
-    "motor/Motor.mat": ("Motor_noise", 162001),
-    "compressor/compressor_16kHz.mat": ("yr", 279378),
+    "duct/Pz1.mat": "Pz1",
+    "duct/Sz.mat": "S",
+    "motor/Motor.mat": "Motor_noise",
+    "compressor/compressor_16kHz.mat": "yr",
 }
 
 
 @pytest.fixture
 def own_files(tmp_path, monkeypatch):
     """A folder of small files in the published layout, which counts as the published one."""
-    for name, (variable, _) in FILES.items():
+    for name, variable in FILES.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         scipy.io.savemat(tmp_path / name, {variable: np.arange(1.0, 4.0)[:, None]})
     publish(tmp_path, monkeypatch)
@@ -75,9 +75,6 @@ def test_only_the_noise_that_is_asked_for_is_needed(own_files, noise, other):
     (wanted,) = {"motor", "compressor"} - {noise}
     with pytest.raises(DataUnavailableError, match=f"{Path(other).name} is missing: put https"):
         load_measured_duct(own_files, noise=wanted)
-
-
-def test_an_unknown_noise_is_refused(own_files):
     with pytest.raises(ValueError, match="noise must be one of 'motor', 'compressor', got 'fan'"):
         load_measured_duct(own_files, noise="fan")
 
@@ -109,14 +106,6 @@ def test_empty_environment_variable_names_no_folder(source, data_folder, tmp_pat
         load_measured_duct()
     assert source.asked == []
     assert dataset_folder() == tmp_path / "cache" / "kfopc_filterpy"
-
-
-def test_changed_file_is_refused_with_both_hashes(own_files):
-    path = own_files / "duct" / "Sz.mat"
-    path.write_bytes(path.read_bytes() + b"\0")
-    found = hashlib.sha256(path.read_bytes()).hexdigest()
-    with pytest.raises(DataUnavailableError, match=rf"Sz\.mat is not the published file, its SHA-256 is {found}"):
-        load_measured_duct(own_files)
 
 
 def test_download_asks_once_for_each_pinned_file_and_keeps_it(source):
@@ -178,26 +167,13 @@ def test_a_dataset_is_fetched_once_to_the_folder_of_the_environment(source, data
 )
 def test_a_fetch_that_fails_ends_at_the_first_file_and_leaves_nothing(source, fault, reason):
     source.fault = fault
-    message = (
-        rf"(?s)http://127.*Pz1\.mat could not be fetched \(.*({reason}).*\): set KFOPC_DATA to a folder with the file"
-    )
+    message = rf"(?s)http://127.*Pz1\.mat could not be fetched \(.*({reason}).*\): set KFOPC_DATA to a folder"
     with pytest.raises(DataUnavailableError, match=message):
         fetch_dataset("duct", timeout_s=0.3 if fault == "silent" else 5.0)
     assert len(source.asked) == 1
     assert left_in(dataset_folder()) == []
     source.fault = "whole"
     assert left_in(fetch_dataset("duct")) == ["Pz1.mat", "Sz.mat"]
-
-
-def test_a_transfer_that_is_cut_after_the_first_file_is_taken_up_again(source, own_files):
-    content = (own_files / "duct" / "Sz.mat").read_bytes()
-    (own_files / "duct" / "Sz.mat").write_bytes(content[:-9])
-    with pytest.raises(DataUnavailableError, match=r"Sz\.mat could not be fetched \(SHA256 hash"):
-        fetch_dataset("duct")
-    assert left_in(dataset_folder()) == ["Pz1.mat"]
-    (own_files / "duct" / "Sz.mat").write_bytes(content)
-    fetch_dataset("duct")
-    assert [path.rsplit("/", 1)[1] for path in source.asked] == ["Pz1.mat", "Sz.mat", "Sz.mat"]
 
 
 def test_without_a_network_what_is_fetched_is_read_and_the_rest_refused(source, own_files, monkeypatch):
@@ -207,16 +183,17 @@ def test_without_a_network_what_is_fetched_is_read_and_the_rest_refused(source, 
         publish_at = f"http://127.0.0.1:{closed.getsockname()[1]}"
     publish(own_files, monkeypatch, host=publish_at)
     assert fetch_dataset("duct") == dataset_folder()
-    with pytest.raises(
-        DataUnavailableError, match=r"(?s)Motor\.mat could not be fetched \(.*refused.*\): set KFOPC_DATA"
-    ):
+    with pytest.raises(DataUnavailableError, match=r"(?s)Motor\.mat could not be fetched \(.*refused"):
         fetch_dataset("motor")
     assert len(source.asked) == 2
 
 
-def test_a_file_that_differs_is_not_overwritten(source, own_files):
+def test_a_file_that_differs_is_refused_with_its_hash_and_not_overwritten(source, own_files):
     path = own_files / "duct" / "Pz1.mat"
     path.write_bytes(b"measured by the user")
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    with pytest.raises(DataUnavailableError, match=rf"Pz1\.mat is not the published file, its SHA-256 is {found}"):
+        load_measured_duct(own_files)
     with pytest.raises(DataUnavailableError, match=r"Pz1\.mat is not the published file.*delete it and fetch it again"):
         fetch_dataset("duct", own_files)
     assert path.read_bytes() == b"measured by the user"
@@ -252,10 +229,11 @@ def test_every_dataset_states_where_it_comes_from():
 
 def test_pinned_hashes_are_those_of_the_published_files(shared_data):
     files = {file.name: file for dataset in list_datasets() for file in dataset.files}
-    assert set(files) >= set(FILES)
-    for name, (variable, _) in FILES.items():
-        assert hashlib.sha256((shared_data / name).read_bytes()).hexdigest() == files[name].sha256
-        assert files[name].variable == variable
+    assert {name: files[name].variable for name in FILES} == FILES
+    there = [file for name, file in files.items() if (shared_data / name).is_file()]
+    assert len(there) >= len(FILES)
+    for file in there:
+        assert hashlib.sha256((shared_data / file.name).read_bytes()).hexdigest() == file.sha256
 
 
 def test_measured_duct_of_own_signals_is_checked():
@@ -263,9 +241,8 @@ def test_measured_duct_of_own_signals_is_checked():
     assert duct.primary.dtype == np.float64
     with pytest.raises(AttributeError):
         duct.fs = 1
-    with pytest.raises(ValueError, match=r"secondary must be one-dimensional"):
-        MeasuredDuct([1], [[1]], [1])
-    with pytest.raises(ValueError, match=r"noise must be finite"):
-        MeasuredDuct([1], [1], [np.nan])
-    with pytest.raises(ValueError, match=r"fs must be greater than 0"):
+    for signals, message in ((([1], [[1]], [1]), "secondary must be one-"), (([1], [1], [np.nan]), "noise must be")):
+        with pytest.raises(ValueError, match=message):
+            MeasuredDuct(*signals)
+    with pytest.raises(ValueError, match="fs must be greater than 0"):
         MeasuredDuct([1], [1], [1], fs=0)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import pickle
 import struct
 import wave
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,15 +13,17 @@ import scipy.io
 import soundfile
 from helpers.files import FS, WRITERS, signal, write_sofa, write_uff
 
+from kfopc_filterpy.paths import read_path
 from kfopc_filterpy.signals import Recording, calibration_factor, read_recording, write_wav
 
 # ---- every format
 
 
-@pytest.mark.parametrize("name", [name for name in WRITERS if name not in ("x.npy", "x.csv", "x.sofa", "rew.txt")])
-def test_every_format_gives_what_was_written(name, tmp_path):
+@pytest.mark.parametrize("read", [read_recording, read_path])
+@pytest.mark.parametrize("name", [name for name in WRITERS if name not in ("x.npy", "x.csv", "x.sofa")])
+def test_every_format_gives_what_was_written(name, read, tmp_path):
     WRITERS[name](tmp_path / name)
-    recording = read_recording(tmp_path / name)
+    recording = read(tmp_path / name)
     expected = signal(2) if recording.samples.ndim == 2 else signal()
     # UFF has 13 digits, the text with times 17, single precision holds 16 bits exactly.
     np.testing.assert_allclose(recording.samples, expected, rtol=0, atol=1e-11 if name.endswith("uff") else 0)
@@ -96,29 +96,21 @@ def test_the_longer_axis_of_an_array_is_time(tmp_path, order):
 
 def test_a_variable_of_several_is_chosen_by_name(tmp_path):
     scipy.io.savemat(tmp_path / "x.mat", {"b": [1.0, 2.0], "a": [3.0, 4.0], "Fs": 8000.0, "who": "me", "z": [1j, 2.0]})
-    with pytest.raises(
-        ValueError, match=r"x\.mat holds several variables: Fs \(1, 1\), a \(1, 2\), b \(1, 2\), z \(1, 2\); choose"
-    ):
-        read_recording(tmp_path / "x.mat")
+    np.savez(tmp_path / "x.npz", a=[1.0, 2.0], b=[3.0, 4.0])
+    write_wav(tmp_path / "x.wav", [1.0, 2.0], FS)
     chosen = read_recording(tmp_path / "x.mat", variable="a")
     assert (chosen.samples.tolist(), chosen.fs) == ([3.0, 4.0], 8000.0)
-    with pytest.raises(ValueError, match=r"variable 'c' is not in .*; it holds: Fs .*, a .*, b "):
-        read_recording(tmp_path / "x.mat", variable="c")
-    with pytest.raises(ValueError, match=r"variable 'who' of .* must hold real numbers, got char"):
-        read_recording(tmp_path / "x.mat", variable="who")
-    with pytest.raises(ValueError, match=r"variable 'z' of .* must hold real numbers, got complex128"):
-        read_recording(tmp_path / "x.mat", variable="z")
-    np.savez(tmp_path / "x.npz", a=[1.0, 2.0], b=[3.0, 4.0])
-    with pytest.raises(
-        ValueError, match=r"x\.npz holds several variables: a \(2,\), b \(2,\); choose one with the option variable"
-    ):
-        read_recording(tmp_path / "x.npz", fs=FS)
     assert read_recording(tmp_path / "x.npz", variable="b", fs=FS).samples.tolist() == [3.0, 4.0]
-    write_wav(tmp_path / "x.wav", [1.0, 2.0], FS)
-    with pytest.raises(
-        ValueError, match=r"x\.wav is an audio file, which has no named variables: leave out the option variable"
+    for name, variable, message in (
+        ("x.mat", None, r"holds several variables: Fs \(1, 1\), a \(1, 2\), b \(1, 2\), z \(1, 2\); choose"),
+        ("x.mat", "c", r"variable 'c' is not in .*; it holds: Fs .*, a .*, b "),
+        ("x.mat", "who", "variable 'who' of .* must hold real numbers, got char"),
+        ("x.mat", "z", "variable 'z' of .* must hold real numbers, got complex128"),
+        ("x.npz", None, r"holds several variables: a \(2,\), b \(2,\); choose one with the option variable"),
+        ("x.wav", "b", "is an audio file, which has no named variables: leave out the option variable"),
     ):
-        read_recording(tmp_path / "x.wav", variable="b")
+        with pytest.raises(ValueError, match=message):
+            read_recording(tmp_path / name, variable=variable)
 
 
 def test_matlab_7_3_has_what_matlab_would_show(tmp_path):
@@ -149,94 +141,48 @@ def test_matlab_7_3_has_what_matlab_would_show(tmp_path):
             read_recording(path, variable=name)
 
 
-# ---- text
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "0.5\n-0.25\n1.0\n",
-        "pressure\n0.5\n-0.25\n1.0\n",
-        "# a comment\n\n  0.5 \r\n -0.25\r\n 1.0",
-        "t,p\n0.000,0.5\n0.00125,-0.25\n0.00250,1.0\n",
-        "t;p\n0,000;0,5\n0,00125;-0,25\n0,00250;1,0\n",
-        "t\tp\n0,000\t0,5\n0,00125\t-0,25\n0,00250\t1,0\n",
-        "1,0.5\n2,-0.25\n3,1.0\n",
-        "\ufefft [s], p [Pa]\n0, 5e-1\n.00125, -25E-2\n.0025, 1\n",
-    ],
-)
-def test_text_of_any_layout_is_read(tmp_path, text):
-    has_time = "125" in text
-    for encoding in ("utf-8", "utf-16"):
-        (tmp_path / "x.txt").write_bytes(text.encode(encoding))
-        recording = read_recording(tmp_path / "x.txt", file_fs=None if has_time else 800)
-        assert recording.samples.tolist() == [0.5, -0.25, 1.0]
-        assert (recording.fs, recording.file_fs) == (800, 800 if has_time else None)
-
-
-def test_a_first_column_that_is_no_time_is_a_channel(tmp_path):
-    (tmp_path / "x.csv").write_text("left,right\n0,1\n1,2\n3,3\n4,4\n")
-    assert read_recording(tmp_path / "x.csv", fs=8).samples.tolist() == [[0.0, 1.0, 3.0, 4.0], [1.0, 2.0, 3.0, 4.0]]
-
-
-def test_times_in_uneven_steps_are_refused(tmp_path):
-    times = np.cumsum(np.linspace(1, 2, 200))
-    np.savetxt(tmp_path / "x.csv", np.column_stack([times, times]), delimiter=",")
-    with pytest.raises(ValueError, match=r"x\.csv has a first column that rises in uneven steps, from 1\.\d* to 2"):
-        read_recording(tmp_path / "x.csv", fs=8)
-
-
-def test_the_rate_of_rounded_times_is_a_whole_number_of_hz(tmp_path):
-    times = np.arange(3000) / 44100
-    np.savetxt(tmp_path / "x.csv", np.column_stack([times, times]), fmt="%.6f", delimiter=",")
-    assert read_recording(tmp_path / "x.csv").fs == 44100
-
-
 # ---- rates and units
 
 
 def test_a_recording_is_resampled_and_keeps_its_height(tmp_path):
-    t = np.arange(44100) / 44100
-    write_wav(tmp_path / "x.wav", [np.sin(2 * np.pi * 1000 * t), np.cos(2 * np.pi * 300 * t)], 44100)
+    def tones(fs):
+        t = np.arange(fs) / fs
+        return np.array([np.sin(2 * np.pi * 1000 * t), np.cos(2 * np.pi * 300 * t)])
+
+    write_wav(tmp_path / "x.wav", tones(44100), 44100)
     recording = read_recording(tmp_path / "x.wav", fs=16000)
-    assert recording.samples.shape == (2, 16000)
-    assert (recording.fs, recording.file_fs) == (16000, 44100)
+    assert (recording.samples.shape, recording.fs, recording.file_fs) == ((2, 16000), 16000, 44100)
     assert "2 x 16000 samples at 16000 Hz (44100 Hz in the file)" in repr(recording)
-    t = np.arange(16000) / 16000
-    inner = slice(100, -100)
-    expected = np.array([np.sin(2 * np.pi * 1000 * t), np.cos(2 * np.pi * 300 * t)])
     # The filter of resample_poly ripples by less than 0.3 % in its pass band.
-    np.testing.assert_allclose(recording.samples[:, inner], expected[:, inner], atol=3e-3)
+    np.testing.assert_allclose(recording.samples[:, 100:-100], tones(16000)[:, 100:-100], atol=3e-3)
 
 
 def test_rates_that_contradict_or_have_no_ratio_are_refused(tmp_path):
     write_wav(tmp_path / "x.wav", np.ones(200), FS)
-    with pytest.raises(
-        ValueError, match=r"x\.wav states a sampling rate of 16000 Hz, but file_fs = 8000 Hz: leave it out"
+    for rates, message in (
+        ({"file_fs": 8000}, r"x\.wav states a sampling rate of 16000 Hz, but file_fs = 8000 Hz: leave it out"),
+        ({"fs": 16000 * np.pi}, "sample rates must be in a ratio of whole numbers"),
+        ({"fs": 0}, "fs must be greater than 0"),
+        ({"fs": FS * 50_000}, r"resampled from 16000 to 8e\+08 Hz it has 1e\+07 samples"),
     ):
-        read_recording(tmp_path / "x.wav", file_fs=8000)
-    with pytest.raises(ValueError, match=r"sample rates must be in a ratio of whole numbers"):
-        read_recording(tmp_path / "x.wav", fs=16000 * np.pi)
-    for fs in (0, -1, np.nan):
-        with pytest.raises(ValueError, match=r"fs must be"):
-            read_recording(tmp_path / "x.wav", fs=fs)
-    with pytest.raises(ValueError, match=r"resampled from 16000 to 8e\+08 Hz it has 1e\+07 samples"):
-        read_recording(tmp_path / "x.wav", fs=FS * 50_000)
+        with pytest.raises(ValueError, match=message):
+            read_recording(tmp_path / "x.wav", **rates)
 
 
 def test_a_scale_comes_with_its_unit(tmp_path):
     write_wav(tmp_path / "x.wav", [0.5, -0.25], FS)
     scaled = read_recording(tmp_path / "x.wav", unit="Pa", unit_per_full_scale=8)
     assert (scaled.samples.tolist(), scaled.unit) == ([4.0, -2.0], "Pa")
-    assert repr(scaled).endswith("at 16000 Hz, in Pa>")
+    assert repr(scaled).endswith("in Pa>")
     named = read_recording(tmp_path / "x.wav", unit="V")
     assert (named.samples.tolist(), named.unit) == ([0.5, -0.25], "V")
-    with pytest.raises(ValueError, match=r'unit_per_full_scale needs the unit of its result: pass unit="Pa"'):
-        read_recording(tmp_path / "x.wav", unit_per_full_scale=8)
-    with pytest.raises(ValueError, match=r"unit_per_full_scale must be greater than 0"):
-        read_recording(tmp_path / "x.wav", unit="Pa", unit_per_full_scale=0)
-    with pytest.raises(ValueError, match=r"calibrator gives scale and unit \(Pa\): leave out unit"):
-        read_recording(tmp_path / "x.wav", unit="V", calibrator=tmp_path / "x.wav")
+    for options, message in (
+        ({"unit_per_full_scale": 8}, "unit_per_full_scale needs the unit of its result"),
+        ({"unit": "Pa", "unit_per_full_scale": 0}, "unit_per_full_scale must be greater than 0"),
+        ({"unit": "V", "calibrator": tmp_path / "x.wav"}, "calibrator gives scale and unit"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_recording(tmp_path / "x.wav", **options)
 
 
 def tone(level: float = 0.1, seconds: float = 2.0, hz: float = 1000.0, fs: float = 48000) -> np.ndarray:
@@ -260,18 +206,13 @@ def test_the_tone_of_a_calibrator_becomes_its_level(tmp_path, rng, level_db, pas
 
 def test_each_channel_has_its_own_calibrator_tone(tmp_path):
     write_wav(tmp_path / "calibrator.wav", [tone(0.1), tone(0.05)], 48000)
-    write_wav(tmp_path / "x.wav", [[0.5, 0.5], [0.5, 0.5]], FS)
-    for channel, expected in ((0, 5.012), (1, 10.024)):
-        read = read_recording(tmp_path / "x.wav", channel=channel, calibrator=tmp_path / "calibrator.wav")
-        np.testing.assert_allclose(read.samples, expected, rtol=1e-4)
-    with pytest.raises(
-        ValueError, match=r"calibrator\.wav has 2 channels where one is needed: read it with channel=0 to"
-    ):
-        read_recording(tmp_path / "x.wav", calibrator=tmp_path / "calibrator.wav")
     write_wav(tmp_path / "mono.wav", tone(0.1), 48000)
-    assert read_recording(tmp_path / "x.wav", channel=1, calibrator=tmp_path / "mono.wav").samples[0] == pytest.approx(
-        5.012, 1e-4
-    )
+    write_wav(tmp_path / "x.wav", [[0.5, 0.5], [0.5, 0.5]], FS)
+    for channel, calibrator, expected in ((0, "calibrator", 5.012), (1, "calibrator", 10.024), (1, "mono", 5.012)):
+        read = read_recording(tmp_path / "x.wav", channel=channel, calibrator=tmp_path / f"{calibrator}.wav")
+        np.testing.assert_allclose(read.samples, expected, rtol=1e-4)
+    with pytest.raises(ValueError, match=r"calibrator\.wav has 2 channels where one is needed"):
+        read_recording(tmp_path / "x.wav", calibrator=tmp_path / "calibrator.wav")
 
 
 @pytest.mark.parametrize(
@@ -300,20 +241,15 @@ def test_channels_lead_and_one_is_chosen(tmp_path):
         file.writeframes(struct.pack("<6h", 16384, 0, -16384, 8192, 0, 1))
     both = read_recording(tmp_path / "x.wav")
     assert both.samples.tolist() == [[0.5, -0.5, 0.0], [0.0, 0.25, 2.0**-15]]
-    with pytest.raises(
-        ValueError, match=r"x\.wav has 2 channels where one is needed: read it with channel=0 to channel=1"
-    ):
+    with pytest.raises(ValueError, match=r"has 2 channels where one is needed: read it with channel=0 to channel=1"):
         both.one_channel()
     for channel in (0, 1):
-        assert (
-            read_recording(tmp_path / "x.wav", channel=channel).one_channel().tolist() == both.samples[channel].tolist()
-        )
+        one = read_recording(tmp_path / "x.wav", channel=channel)
+        np.testing.assert_array_equal(one.one_channel(), both.samples[channel])
     with pytest.raises(ValueError, match=r"channel must be below the 2 channel\(s\) of .*x\.wav, got 2"):
         read_recording(tmp_path / "x.wav", channel=2)
-    with pytest.raises(ValueError, match=r"channel must be at least 0"):
+    with pytest.raises(ValueError, match="channel must be at least 0"):
         read_recording(tmp_path / "x.wav", channel=-1)
-    with pytest.raises(TypeError, match=r"channel must be a whole number"):
-        read_recording(tmp_path / "x.wav", channel="left")
 
 
 def test_a_recording_cannot_be_changed_or_made_of_nothing():
@@ -321,108 +257,83 @@ def test_a_recording_cannot_be_changed_or_made_of_nothing():
     with pytest.raises(AttributeError):
         recording.fs = 1
     assert repr(recording) == "<Recording: 0.00025 s, 2 samples at 8000 Hz>"
-    with pytest.raises(ValueError, match=r"samples must have at least 1 value"):
-        Recording([], 8000)
-    with pytest.raises(ValueError, match=r"the signal of x must be finite"):
-        Recording([np.inf], 8000, name="x")
-    with pytest.raises(ValueError, match=r"fs must be greater than 0"):
-        Recording([1], 0)
+    for samples, fs, message in (([], 1, "at least 1 value"), ([np.inf], 1, "the signal of x must be"), ([1], 0, "fs")):
+        with pytest.raises(ValueError, match=message):
+            Recording(samples, fs, name="x")
 
 
 # ---- files that are wrong
 
 
-@pytest.mark.parametrize("name", ["pcm16.wav", "x.npz", "plain.mat", "x.csv", "x.uff", "x.sofa", "x.unknown"])
-def test_a_missing_or_empty_file_is_refused(name, tmp_path):
+@pytest.mark.parametrize(
+    "name", ["x.wav", "x.flac", "x.mat", "x.npy", "x.npz", "x.csv", "x.uff", "x.sofa", "x.unknown"]
+)
+def test_a_file_that_is_missing_empty_or_something_else_is_refused(name, tmp_path):
+    pytest.importorskip({"x.sofa": "h5py", "x.uff": "pyuff"}.get(name, "numpy"))
     with pytest.raises(FileNotFoundError, match=rf"{name} does not exist or is not a file; the current folder is"):
         read_recording(tmp_path / name)
-    (tmp_path / name).write_bytes(b"")
-    with pytest.raises(ValueError, match=rf"{name} is empty \(0 bytes\): record or export it again"):
-        read_recording(tmp_path / name)
-
-
-CUT = {
-    "pcm16.wav": "is cut short: its header claims 1244 bytes, 1044 are there",
-    "float.wav": "is cut short: its header claims",
-    "long.rf64": "is cut short: its header claims",
-    "x.aiff": "is cut short: its header claims",
-    "x.flac": "cannot be read as an audio file|is cut short",
-    "x.npy": "cannot be read as a .npy file: cannot reshape .* cut short",
-    "x.npz": "cannot be read as a .npz file: File is not a zip file",
-    "packed.mat": "cannot be read as a MAT file.* cut short",
-    "plain.mat": "cannot be read as a MAT file.* cut short",
-    "four.mat": "cannot be read as a MAT file",
-    "new.mat": "cannot be read as a MAT file",
-    "rew.txt": r"is damaged or cut short: its header claims 300 samples, got \(2\d\d,\)",
-    "x.uff": "has no whole data set 58|is damaged or cut short",
-    "binary.uff": "has no whole data set 58|is damaged or cut short",
-    "x.sofa": "cannot be read as a SOFA file",
-}
-
-
-@pytest.mark.parametrize("name", CUT)
-def test_a_truncated_file_is_refused(name, tmp_path):
-    path = tmp_path / name
-    WRITERS[name](path)
-    path.write_bytes(path.read_bytes()[:-200])
-    if name.endswith(".uff"):  # a file with one data set
-        write_uff(path, signal(), binary=name == "binary.uff")
-        path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(ValueError, match=rf"{name} ({CUT[name]})"):
-        read_recording(path, fs=FS)
-
-
-def put(path: Path, at: int, what: bytes) -> None:
-    content = path.read_bytes()
-    path.write_bytes(content[:at] + what + content[at + len(what) :])
-
-
-def test_a_header_that_lies_is_refused(tmp_path):
-    for name in ("pcm16.wav", "x.aiff", "x.flac", "x.npy", "four.mat", "plain.mat"):
-        WRITERS[name](tmp_path / name)
-    content = (tmp_path / "pcm16.wav").read_bytes()
-    put(tmp_path / "pcm16.wav", content.index(b"data") + 4, struct.pack("<I", 10**9))
-    content = (tmp_path / "x.aiff").read_bytes()
-    put(tmp_path / "x.aiff", content.index(b"SSND") + 4, struct.pack(">I", 10**9))
-    put(tmp_path / "x.flac", 18 + 5, struct.pack(">I", 10**6))  # the low half of STREAMINFO's 36-bit number of samples
-    content = (tmp_path / "x.npy").read_bytes()
-    put(tmp_path / "x.npy", content.index(b"300"), b"999")
-    put(tmp_path / "four.mat", 4, struct.pack("<i", 10**9))
-    content = (tmp_path / "plain.mat").read_bytes()
-    put(tmp_path / "plain.mat", content.index(struct.pack("<I", 300)), struct.pack("<I", 10**9))
-    for name, message in (
-        ("pcm16.wav", r"is cut short: its header claims 10000000\d\d bytes, 1244 are there"),
-        ("x.aiff", r"is cut short: its header claims 10000000\d\d bytes, 1254 are there"),
-        ("x.flac", r"is cut short|cannot be read as an audio file"),
-        ("x.npy", r"cannot be read as a .npy file: cannot reshape array of size 600 into shape \(2,999\)"),
-        ("four.mat", r"claims 1e\+09 samples"),
-        ("plain.mat", r"claims 1e\+09 samples"),
+    for content, message in (
+        (b"", r" is empty \(0 bytes\): record or export it again"),
+        (b"RIFF", ""),
+        (bytes(range(256)) * 8, ""),
     ):
-        with pytest.raises(ValueError, match=rf"{name}.* {message}|{message}"):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=name + message):
             read_recording(tmp_path / name, fs=FS)
 
 
+@pytest.mark.parametrize("name", [name for name in WRITERS if not name.endswith(".csv")])
+def test_a_truncated_file_is_refused(name, tmp_path):
+    path = tmp_path / name
+    if name.endswith(".uff"):  # a file with one data set
+        write_uff(path, signal(), binary=name == "binary.uff")
+    else:
+        WRITERS[name](path)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(ValueError, match=f"{name} (is cut short|is damaged|cannot be read as a|has no whole data set)"):
+        read_recording(path, fs=FS)
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "claimed", "message"),
+    [
+        (
+            "pcm16.wav",
+            b"data",
+            struct.pack("<I", 10**9),
+            r"is cut short: its header claims 10\d* bytes, 1244 are there",
+        ),
+        ("x.aiff", b"SSND", struct.pack(">I", 10**9), r"is cut short: its header claims 10\d* bytes, 1254 are there"),
+        # The low half of STREAMINFO's 36-bit number of samples.
+        ("x.flac", 18 + 5, struct.pack(">I", 10**6), "is cut short|cannot be read as an audio file"),
+        ("x.npy", b"(2, ", b"999", r"is damaged: .* 15984 bytes of data, shape \(2, 999\), but 4800 are there"),
+        ("four.mat", 4, struct.pack("<i", 10**9), r"is damaged: its header claims the shape \(1000000000, 1\)"),
+        ("plain.mat", b"\5\0\0\0\x08\0\0\0", struct.pack("<I", 10**9), r"the shape \(1000000000, 1\)"),
+    ],
+)
+def test_a_header_that_lies_is_refused(name, before, claimed, message, tmp_path):
+    WRITERS[name](tmp_path / name)
+    content = (tmp_path / name).read_bytes()
+    at = before if isinstance(before, int) else content.index(before) + len(before)
+    (tmp_path / name).write_bytes(content[:at] + claimed + content[at + len(claimed) :])
+    with pytest.raises(ValueError, match=rf"{name} .*({message})"):
+        read_recording(tmp_path / name, fs=FS)
+
+
 def test_a_file_without_samples_is_refused(tmp_path):
-    h5py = pytest.importorskip("h5py")
     for name in ("x.wav", "x.aiff", "x.flac"):
         soundfile.write(tmp_path / name, np.zeros((0, 2)), FS)
     np.save(tmp_path / "x.npy", np.zeros((2, 0)))
     np.savez(tmp_path / "x.npz", noise=np.zeros(0))
     scipy.io.savemat(tmp_path / "x.mat", {"noise": np.zeros((0, 0))})
-    with h5py.File(tmp_path / "new.mat", "w", userblock_size=512) as file:
-        empty = file.create_dataset("noise", data=np.uint64([0, 0]))
-        empty.attrs["MATLAB_class"], empty.attrs["MATLAB_empty"] = np.bytes_("double"), np.uint8(1)
-    put(tmp_path / "new.mat", 0, b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     (tmp_path / "x.csv").write_text("left,right\n")
     for name, message in (
-        ("x.wav", r"holds no samples: its header claims zero frames"),
-        ("x.aiff", r"holds no samples: its header claims zero frames"),
+        ("x.wav", "holds no samples: its header claims zero frames"),
+        ("x.aiff", "holds no samples: its header claims zero frames"),
         ("x.flac", r"is empty \(0 bytes\)"),  # libsndfile writes nothing
         ("x.npy", r"holds no samples, shape \(2, 0\)"),
-        ("x.npz", r"variable 'noise' of .*x\.npz is empty"),
-        ("x.mat", r"variable 'noise' of .*x\.mat is empty"),
-        ("new.mat", r"variable 'noise' of .*new\.mat is empty"),
-        ("x.csv", r"is text that is no numbers"),
+        *((name, rf"variable 'noise' of .*{name} is empty") for name in ("x.npz", "x.mat")),
+        ("x.csv", "is text that is no numbers"),
     ):
         with pytest.raises(ValueError, match=message):
             read_recording(tmp_path / name, fs=FS)
@@ -435,9 +346,7 @@ def test_nan_is_refused_with_its_place_and_only_in_the_channel_that_is_read(tmp_
     np.savetxt(tmp_path / "x.csv", table.T, delimiter=",")
     scipy.io.savemat(tmp_path / "x.mat", {"noise": table})
     for name in ("x.wav", "x.npy", "x.csv", "x.mat"):
-        with pytest.raises(
-            ValueError, match=rf"{name} must be finite, but holds NaN or Inf \(first at index \(0, 1\)\)"
-        ):
+        with pytest.raises(ValueError, match=rf"{name} must be finite, .* \(first at index \(0, 1\)\)"):
             read_recording(tmp_path / name, fs=FS)
         assert read_recording(tmp_path / name, channel=1, fs=FS).samples.tolist() == [0.0, 0.0, 1.0]
 
@@ -455,30 +364,8 @@ def test_text_that_is_no_numbers_is_refused(tmp_path, name, content):
 @pytest.mark.parametrize("text", ["0.5,1\n0.25,2\n0.125", "1\n2\nstopped by user\n"])
 def test_a_row_of_another_length_is_refused(tmp_path, text):
     (tmp_path / "x.csv").write_text(text)
-    with pytest.raises(
-        ValueError, match=r"x\.csv is damaged or cut short, .*, the number of columns changed from \d to \d at row \d+$"
-    ):
+    with pytest.raises(ValueError, match=r"x\.csv is damaged or cut short, .* columns changed from \d to \d at row"):
         read_recording(tmp_path / "x.csv", fs=FS)
-
-
-@pytest.mark.parametrize("name", ["x.wav", "x.flac", "x.mat", "x.npy", "x.npz", "x.sofa", "x.uff"])
-@pytest.mark.parametrize("content", [b"RIFF", bytes(range(256)) * 8])
-def test_a_file_that_is_something_else_is_refused(tmp_path, name, content):
-    if name in ("x.sofa", "x.uff"):
-        pytest.importorskip("h5py" if name == "x.sofa" else "pyuff")
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=name):
-        read_recording(tmp_path / name, fs=FS)
-
-
-@pytest.mark.parametrize(
-    ("kind", "coding"),
-    [("OGG", "VORBIS"), ("AU", "PCM_16"), ("MP3", "MPEG_LAYER_III"), ("WAV", "IMA_ADPCM"), ("WAV", "ULAW")],
-)
-def test_formats_that_lose_something_or_are_not_checked_are_refused(tmp_path, kind, coding):
-    soundfile.write(tmp_path / "x.wav", signal(1, 4000), FS, format=kind, subtype=coding)
-    with pytest.raises(ValueError, match=r"x\.wav is .*, .*, expected WAV, AIFF or FLAC without loss: record it again"):
-        read_recording(tmp_path / "x.wav")
 
 
 def test_nothing_is_unpickled(tmp_path):
@@ -489,15 +376,14 @@ def test_nothing_is_unpickled(tmp_path):
     np.save(tmp_path / "x.npy", np.array([Trap(), Trap()], dtype=object), allow_pickle=True)
     np.savez(tmp_path / "x.npz", noise=np.array([Trap(), Trap()], dtype=object))
     (tmp_path / "pickled.npy").write_bytes(pickle.dumps(Trap()))
-    for name, message in (
-        ("x.npy", r"x\.npy must hold real numbers, got object"),
-        ("x.npz", r"x\.npz holds no signal: no array of real numbers"),
-        ("pickled.npy", r"pickled\.npy cannot be read as a \.npy file"),
+    for name, variable, message in (
+        ("x.npy", None, r"x\.npy must hold real numbers, got object"),
+        ("x.npz", None, r"x\.npz holds no signal: no array of real numbers"),
+        ("x.npz", "noise", "variable 'noise' of .* must hold real numbers, got object"),
+        ("pickled.npy", None, r"pickled\.npy cannot be read as a \.npy file"),
     ):
         with pytest.raises(ValueError, match=message):
-            read_recording(tmp_path / name, fs=FS)
-    with pytest.raises(ValueError, match=r"variable 'noise' of .* must hold real numbers, got object"):
-        read_recording(tmp_path / "x.npz", variable="noise", fs=FS)
+            read_recording(tmp_path / name, variable=variable, fs=FS)
     assert not (tmp_path / "sprung").exists()
 
 
@@ -506,8 +392,7 @@ def test_without_its_library_the_error_names_the_extra(name, library, tmp_path, 
     WRITERS[name](tmp_path / name)
     uninstall(library)
     with pytest.raises(
-        ModuleNotFoundError,
-        match=rf"{name} is .* which needs {library}: install the extra `formats`, .*pip install -e .\.\[formats\].",
+        ModuleNotFoundError, match=rf"{name} is .* which needs {library}: .*pip install -e .\.\[formats\]."
     ):
         read_recording(tmp_path / name)
 
@@ -527,46 +412,21 @@ def test_uff_of_other_things_than_signals_is_refused(tmp_path):
 
 def test_a_sofa_file_is_no_recording(tmp_path):
     write_sofa(tmp_path / "x.sofa", signal(2)[None, :, :50])
-    with pytest.raises(
-        ValueError, match=r"x\.sofa must hold signals, .*; read impulse responses with paths\.read_path"
-    ):
+    with pytest.raises(ValueError, match=r"must hold signals, .*; read impulse responses with paths\.read_path"):
         read_recording(tmp_path / "x.sofa")
 
 
-def test_a_wav_of_unknown_size_is_read_and_unknown_chunks_are_passed_over(tmp_path):
-    write_wav(tmp_path / "x.wav", [0.5, -0.5], FS)
-    content = (tmp_path / "x.wav").read_bytes()
-    (tmp_path / "x.wav").write_bytes(content[:4] + 4 * b"\xff" + content[8:])
-    assert read_recording(tmp_path / "x.wav").samples.tolist() == [0.5, -0.5]
-    marked = content + b"cue " + struct.pack("<I", 4) + bytes(4)
-    (tmp_path / "x.wav").write_bytes(marked[:4] + struct.pack("<I", len(marked) - 8) + marked[8:])
-    assert read_recording(tmp_path / "x.wav").samples.tolist() == [0.5, -0.5]
-
-
-def test_an_archive_that_is_damaged_inside_is_refused(tmp_path):
+@pytest.mark.parametrize("inside", ["no array", "cut short"])
+def test_an_archive_that_is_damaged_inside_is_refused(inside, tmp_path):
+    np.save(tmp_path / "noise.npy", np.zeros(100))
+    content = b"no array" if inside == "no array" else (tmp_path / "noise.npy").read_bytes()[:-8]
     with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
-        archive.writestr("noise.npy", b"no array")
-    with pytest.raises(ValueError, match=r"x\.npz cannot be read as a \.npz file: the magic string is not correct"):
-        read_recording(tmp_path / "x.npz", fs=FS)
-    buffer = io.BytesIO()
-    np.save(buffer, np.zeros(100))
-    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
-        archive.writestr("noise.npy", buffer.getvalue()[:-8])
-    with pytest.raises(ValueError, match=r"x\.npz cannot be read as a \.npz file: cannot reshape"):
+        archive.writestr("noise.npy", content)
+    with pytest.raises(ValueError, match=r"x\.npz cannot be read as a \.npz file: (the magic string|cannot reshape)"):
         read_recording(tmp_path / "x.npz", fs=FS)
 
 
 # ---- writing
-
-
-def test_wav_with_one_peak_shares_one_scale(tmp_path):
-    loud = np.array([4.0, -4.0, 1.0])
-    for name, samples in (("loud", loud), ("soft", loud / 10)):
-        write_wav(tmp_path / f"{name}.wav", samples, 16000, peak=4.0)
-        with wave.open(str(tmp_path / f"{name}.wav")) as file:
-            assert (file.getsampwidth(), file.getnchannels(), file.getframerate()) == (2, 1, 16000)
-            stored = np.frombuffer(file.readframes(3), "<i2")
-        np.testing.assert_array_equal(stored, np.round(samples / 4.0 * 32767))
 
 
 def test_wav_writes_the_tail_of_a_diverged_run_as_silence(tmp_path):
@@ -600,19 +460,17 @@ def test_the_same_signal_gives_the_same_bytes(tmp_path):
         assert (tmp_path / "x.wav").read_bytes() == content
 
 
-def test_wav_refusals(tmp_path):
-    path = tmp_path / "x.wav"
-    for arguments, message in (
-        (([], 16000), r"signal must have at least 1 value"),
-        (([np.nan, 1.0], 16000), r"signal must be finite.*index 0"),
-        (([np.inf], 16000), r"signal must be finite"),
-        (([[[1.0, 2.0]]], 16000), r"signal must be \(n_samples,\) or \(n_channels, n_samples\), got shape \(1, 1, 2\)"),
-        (([[1.0], [2.0]], 16000), r"signal must have its channels first.*transpose it"),
-        (([1.0], 16000.5), r"fs must be a whole number of Hz"),
-        (([1.0], 0), r"fs must be greater than 0"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            write_wav(path, *arguments)
-    with pytest.raises(ValueError, match=r"signal reaches 2, beyond peak = 1; raise peak"):
-        write_wav(path, [2.0], 16000, peak=1.0)
-    assert not path.exists()
+@pytest.mark.parametrize(
+    ("signal", "options", "message"),
+    [
+        ([np.nan, 1.0], {}, "signal must be finite.*index 0"),  # no tail
+        ([np.inf], {}, "signal must be finite"),
+        ([[1.0], [2.0]], {}, "signal must have its channels first"),
+        ([1.0], {"fs": 16000.5}, "fs must be a whole number of Hz"),
+        ([2.0], {"peak": 1.0}, "signal reaches 2, beyond peak = 1; raise peak"),
+    ],
+)
+def test_wav_refusals(signal, options, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        write_wav(tmp_path / "x.wav", signal, **{"fs": 16000} | options)
+    assert not (tmp_path / "x.wav").exists()

@@ -28,11 +28,6 @@ def test_tone_is_the_sine_of_its_definition():
     np.testing.assert_allclose(x, expected, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize(("duration", "samples"), [(1.0, 16000), (0.00006, 1), (0.99997, 16000), (10.1, 161600)])
-def test_durations_round_to_the_nearest_sample(duration, samples):
-    assert tone(100.0, duration, fs=FS).shape == (samples,)
-
-
 def test_band_limited_noise_has_its_power_in_its_band_only():
     x = band_limited_noise((200.0, 2000.0), 4.0, fs=FS, power=0.8, rng=3)
     assert np.mean(x**2) == pytest.approx(0.8, rel=EXACT)
@@ -61,23 +56,6 @@ def test_band_limited_noise_takes_the_whole_band():
     np.testing.assert_allclose(x, white / np.sqrt(np.mean(white**2)), rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda rng: band_limited_noise((200.0, 2000.0), 0.5, fs=FS, rng=rng),
-        lambda rng: compressor_noise(0.5, fs=FS, rng=rng),
-    ],
-)
-def test_a_seed_repeats_and_the_global_state_is_left_alone(make):
-    np.random.seed(0)  # noqa: NPY002 - the state that must not matter
-    before = np.random.get_state()[1].copy()  # noqa: NPY002
-    first = make(7)
-    np.testing.assert_array_equal(first, make(7))
-    np.testing.assert_array_equal(first, make(np.random.default_rng(7)))
-    assert not np.array_equal(first, make(8))
-    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
-
-
 def test_compressor_with_steady_speed_and_levels_is_a_sum_of_exact_harmonics():
     x = compressor_noise(
         2.0,
@@ -95,15 +73,10 @@ def test_compressor_with_steady_speed_and_levels_is_a_sum_of_exact_harmonics():
 
 
 def test_compressor_lobe_lines_stand_out():
+    steady = Compressor(shaft_hz=25.0, speed_fluctuation=0.0, level_fluctuation=0.0, broadband_ratio=0.0)
     ratios = []
     for seed in range(40):
-        x = compressor_noise(
-            2.0,
-            Compressor(shaft_hz=25.0, speed_fluctuation=0.0, level_fluctuation=0.0, broadband_ratio=0.0),
-            fs=FS,
-            rng=seed,
-        )
-        energy = np.abs(np.fft.rfft(x)) ** 2
+        energy = np.abs(np.fft.rfft(compressor_noise(2.0, steady, fs=4000, rng=seed))) ** 2
         # Orders 9 and 11 surround order 10, the peak of the envelope; 8 and 12 are lobe lines.
         ratios.append(10 * np.log10(energy[50 * 12] * energy[50 * 8] / (energy[50 * 9] * energy[50 * 11])) / 2)
     # 10 dB apart; four independent spreads of 3 dB, halved, over 40 seeds: standard error 0.5 dB.
@@ -165,49 +138,19 @@ def test_scaled_signal_has_the_power_and_the_shape(values, power):
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: tone(8000.0, 1.0, fs=FS), ValueError, r"frequency_hz must be below fs/2 = 8000 Hz"),
-        (lambda: tone(0.0, 1.0, fs=FS), ValueError, r"frequency_hz must be greater than 0"),
-        (lambda: tone(400.0, 1.0, fs=FS, amplitude=-1.0), ValueError, r"amplitude must not be negative"),
-        (lambda: tone(400.0, 1e-6, fs=FS), ValueError, r"duration_s must be at least one sample"),
-        (lambda: tone(400.0, 1.0, fs=0), ValueError, r"fs must be greater than 0"),
-        (lambda: tone(400.0, 1.0, fs=FS, phase_rad=np.nan), ValueError, r"phase_rad must be finite"),
-        (lambda: band_limited_noise((200, 9000), 1.0, fs=FS, rng=1), ValueError, r"band must satisfy"),
-        (lambda: band_limited_noise((201, 210), 0.01, fs=FS, rng=1), ValueError, r"too short for the band 201 to"),
-        (lambda: band_limited_noise((200, 2000), 1.0, fs=FS, rng=None), TypeError, r"rng must be a seed"),
-        (lambda: band_limited_noise((200, 2000), 1.0, fs=FS, power=0, rng=1), ValueError, r"power must be greater"),
-        (
-            lambda: compressor_noise(1.0, Compressor(n_harmonics=400), fs=FS, rng=1),
-            ValueError,
-            r"beyond fs/2 = 8000 Hz",
-        ),
-        (
-            lambda: compressor_noise(1.0, Compressor(n_harmonics=0), fs=FS, rng=1),
-            ValueError,
-            r"n_harmonics must be at least 1",
-        ),
-        (
-            lambda: compressor_noise(1.0, Compressor(broadband_ratio=1.0), fs=FS, rng=1),
-            ValueError,
-            r"broadband_ratio must be",
-        ),
-        (
-            lambda: compressor_noise(1.0, Compressor(bandwidth_hz=9e3), fs=FS, rng=1),
-            ValueError,
-            r"bandwidth_hz must be at most fs/2 = 8000 Hz",
-        ),
-        (lambda: Compressor(bandwidth_hz=20.0), ValueError, r"bandwidth_hz must be above 20 Hz, got 20 Hz"),
-        (
-            lambda: compressor_noise(0.001, Compressor(bandwidth_hz=500), fs=FS, rng=1),
-            ValueError,
-            r"too short for the broadband part, 20 to 500 Hz",
-        ),
-        (lambda: compressor_noise(1.0, fs=FS, rng=None), TypeError, r"rng must be a seed"),
-        (lambda: level_jump([1.0, 2.0], 1.0, 6.0, fs=2), ValueError, r"at_s must lie within the signal of 1 s"),
-        (lambda: level_jump([1.0, 2.0], -1.0, 6.0, fs=2), ValueError, r"at_s must not be negative"),
-        (lambda: scaled_to_power([0.0, 0.0], 1.0), ValueError, r"signal must not be all zeros"),
-        (lambda: scaled_to_power([], 1.0), ValueError, r"signal must have at least 1 value"),
-        (lambda: scaled_to_power([1j], 1.0), TypeError, r"signal must be a sequence of real numbers, got complex"),
-        (lambda: scaled_to_power([[1.0], [1.0, 2.0]], 1.0), TypeError, r"got list, whose rows differ in length"),
+        (lambda: tone(8000.0, 1.0, fs=FS), ValueError, "frequency_hz must be below fs/2 = 8000 Hz"),
+        (lambda: tone(400.0, 1.0, fs=FS, amplitude=-1.0), ValueError, "amplitude must not be negative"),
+        (lambda: band_limited_noise((200, 9000), 1.0, fs=FS, rng=1), ValueError, "band must satisfy"),
+        (lambda: band_limited_noise((201, 210), 0.01, fs=FS, rng=1), ValueError, "too short for the band 201 to"),
+        (lambda: band_limited_noise((200, 2000), 1.0, fs=FS, rng=None), TypeError, "rng must be a seed"),
+        (lambda: compressor_noise(1.0, Compressor(n_harmonics=400), fs=FS, rng=1), ValueError, "beyond fs/2"),
+        (lambda: Compressor(broadband_ratio=1.0), ValueError, "broadband_ratio must be"),
+        (lambda: Compressor(bandwidth_hz=20.0), ValueError, "bandwidth_hz must be above 20 Hz, got 20 Hz"),
+        (lambda: compressor_noise(1.0, Compressor(bandwidth_hz=9e3), fs=FS, rng=1), ValueError, "at most fs/2"),
+        (lambda: compressor_noise(0.001, Compressor(bandwidth_hz=500), fs=FS, rng=1), ValueError, "too short for"),
+        (lambda: level_jump([1.0, 2.0], 1.0, 6.0, fs=2), ValueError, "at_s must lie within the signal of 1 s"),
+        (lambda: scaled_to_power([0.0, 0.0], 1.0), ValueError, "signal must not be all zeros"),
+        (lambda: scaled_to_power([1j], 1.0), TypeError, "signal must be a sequence of real numbers"),
     ],
 )
 def test_refusals_say_what_was_wrong(call, error, message):
