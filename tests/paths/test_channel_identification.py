@@ -1,5 +1,6 @@
 """Identification of the paths of several loudspeakers: numpy's least squares as the oracle, and what noise does to it."""
 
+import control
 import numpy as np
 import pytest
 import scipy.signal
@@ -25,9 +26,10 @@ def delays_of(signal, n_taps):
     return np.lib.stride_tricks.sliding_window_view(signal, n_taps)[:, ::-1]
 
 
+@pytest.mark.parametrize("n_loudspeakers", [1, 2])
 @pytest.mark.parametrize("regularization", [0.0, 1e-3])
-def test_loudspeakers_at_once_are_one_least_squares_problem(regularization):
-    sent, heard = recordings()
+def test_loudspeakers_at_once_are_one_least_squares_problem(regularization, n_loudspeakers):
+    sent, heard = (signals[:n_loudspeakers] for signals in recordings())
     together = heard.sum(axis=0)
     found = estimate_path(sent, together, N_TAPS, FS, regularization=regularization)
     rows = np.hstack([delays_of(signal, N_TAPS) for signal in sent])
@@ -35,10 +37,13 @@ def test_loudspeakers_at_once_are_one_least_squares_problem(regularization):
     # A ridge is least squares with a row for each weight.
     powers = [np.mean(signal[N_TAPS - 1 :] ** 2) for signal in sent]
     ridge = np.diag(np.sqrt(len(rows) * regularization * np.repeat(powers, N_TAPS)))
-    expected = np.linalg.lstsq(np.vstack([rows, ridge]), np.vstack([target, np.zeros((2 * N_TAPS, 3))]), rcond=None)[0]
-    np.testing.assert_allclose(found.taps, expected.T.reshape(3, 2, N_TAPS), atol=1e-10)
+    expected = np.linalg.lstsq(np.vstack([rows, ridge]), np.vstack([target, np.zeros((len(ridge), 3))]), rcond=None)[0]
+    np.testing.assert_allclose(found.taps, expected.T.reshape(3, -1, N_TAPS), atol=1e-10)
     left = np.mean((target - rows @ expected) ** 2, axis=0) / np.mean(target**2, axis=0)
-    np.testing.assert_allclose(found.residual_db, 10 * np.log10(left), rtol=1e-8)
+    np.testing.assert_allclose(np.ravel(found.residual_db), 10 * np.log10(left), rtol=1e-8)
+    taps, rate = path_matrix(found.estimate, fs=None, name="estimate")
+    np.testing.assert_array_equal(taps, found.taps)
+    assert rate == FS
 
 
 def test_loudspeakers_in_turn_are_a_problem_each():
@@ -57,20 +62,11 @@ def test_loudspeakers_in_turn_are_a_problem_each():
 
 def test_one_loudspeaker_and_several_microphones_or_the_other_way_round():
     sent, heard = recordings()
-    several = estimate_path(sent[0], heard[0], N_TAPS, FS)
-    assert several.taps.shape == (3, 1, N_TAPS)
-    np.testing.assert_array_equal(several.taps[1, 0], estimate_path(sent[0], heard[0, 1], N_TAPS, FS).taps)
-    one = estimate_path(sent, heard.sum(axis=0)[2], N_TAPS, FS)
-    np.testing.assert_allclose(one.taps[0], estimate_path(sent, heard.sum(axis=0), N_TAPS, FS).taps[2], atol=1e-12)
-
-
-def test_estimate_is_a_system_of_several_channels():
-    sent, heard = recordings()
-    found = estimate_path(sent, heard, N_TAPS, FS)
-    taps, rate = path_matrix(found.estimate, fs=None, name="estimate")
-    assert rate == FS
-    assert (found.estimate.noutputs, found.estimate.ninputs) == (3, 2)
-    np.testing.assert_array_equal(taps, found.taps)
+    several = estimate_path(sent[0], heard[0], N_TAPS, FS).taps
+    assert several.shape == (3, 1, N_TAPS)
+    np.testing.assert_array_equal(several[1, 0], estimate_path(sent[0], heard[0, 1], N_TAPS, FS).taps)
+    one, together = (estimate_path(sent, y, N_TAPS, FS).taps for y in (heard.sum(axis=0)[2], heard.sum(axis=0)))
+    np.testing.assert_allclose(one[0], together[2], atol=1e-12)
 
 
 @pytest.mark.parametrize("loudspeakers", ["in turn", "at once"])
@@ -131,15 +127,14 @@ def test_each_loudspeaker_has_its_amplifier():
 
 
 @pytest.mark.parametrize("loudspeakers", ["in turn", "at once"])
-def test_a_matrix_of_one_path_gives_the_taps_of_the_path(loudspeakers):
+def test_a_matrix_of_one_path_gives_what_the_path_gives(loudspeakers):
     settings = {"n_taps": 20, "duration_s": 0.3, "rng": 5, "fs": FS, "sensor_noise_std": 0.1}
     alone = identify_secondary_path(PATHS[0, 0], **settings)
     matrix = identify_secondary_path(PATHS[:1, :1], **settings, loudspeakers=loudspeakers)
-    np.testing.assert_array_equal(matrix.taps[0, 0], alone.taps)
-    np.testing.assert_array_equal(matrix.modelling_error_db[0, 0], alone.modelling_error_db)
-    assert matrix.misalignment_db[0, 0] == alone.misalignment_db
-    assert isinstance(alone.misalignment_db, float)
-    assert isinstance(alone.residual_db, float)
+    for name in ("taps", "modelling_error_db", "misalignment_db"):
+        np.testing.assert_array_equal(getattr(matrix, name)[0, 0], getattr(alone, name))
+    assert (type(alone.estimate), alone.estimate.dt) == (control.TransferFunction, 1 / FS)
+    assert {type(alone.misalignment_db), type(alone.residual_db)} == {float}
 
 
 NOISES = np.random.default_rng(0).standard_normal((3, 100))
@@ -152,15 +147,9 @@ NOISES = np.random.default_rng(0).standard_normal((3, 100))
         ([NOISES[0, 2:], -NOISES[0, :-2]], NOISES[:, 2:], r"excitation\[1\] must not be correlated"),
         (NOISES[:2] * [[1], [0]], NOISES, r"excitation\[1\] must not be silent"),
         (NOISES[:2], NOISES * [[1], [1], [0]], r"response\[2\] must not be silent"),
-        (NOISES[:2], NOISES[:, :-1], "response must have 100 samples, as excitation has, got 99"),
-        (NOISES[:2, :10], NOISES[:, :10], "excitation must have at least 11 samples for these paths, got 10"),
         (NOISES[:2], NOISES[np.newaxis].repeat(3, 0), r"excitation must be .* = \(3, 100\) for a response of shape .*"),
-        (NOISES[:2, :6], NOISES[:2, np.newaxis, :6], "excitation must have at least 7 samples for these paths, got 6"),
         (NOISES[0], NOISES[:2, np.newaxis] * [[[1]], [[0]]], r"response\[1\]\[0\] must not be silent"),
-        (NOISES[0], np.full((2, 2, 100), np.nan), r"response must be finite"),
-        (NOISES[0], NOISES.T[np.newaxis], "response must have its channels first"),
         (NOISES[0], np.zeros((0, 2, 100)), r"response must be \(J loudspeakers, K microphones, n_samples\), got shape"),
-        (NOISES[0], np.zeros((1, 1, 1, 100)), "response must be .n_samples,. or"),
     ],
 )
 def test_estimate_refuses(sent, heard, message):
@@ -172,11 +161,9 @@ def test_estimate_refuses(sent, heard, message):
     ("changes", "message"),
     [
         ({"fs": None}, "fs must be given if secondary_path is a tap array"),
-        ({"loudspeakers": "together"}, "loudspeakers must be one of 'in turn', 'at once'"),
         ({"duration_s": 0.004, "loudspeakers": "at once"}, "duration_s must be at least 0.00438 s for 12 taps"),
         ({"secondary_path": PATHS * np.array([1.0, 0.0])[:, None]},
          r"secondary_path\[0\]\[1\] must not be all zeros.*unplugged"),
-        ({"secondary_path": PATHS[0]}, r"secondary_path must have shape \(K microphones, J loudspeakers, taps\)"),
     ],
 )  # fmt: skip
 def test_identification_refuses(changes, message):

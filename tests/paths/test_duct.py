@@ -51,15 +51,8 @@ def test_wall_loss_lowers_resonances_by_its_dispersion():
 
 def test_lossless_secondary_path_is_the_sum_of_its_images():
     length, speaker, error, (r0, r1), latency = 2.0, 1.2, 1.7, (0.6, -0.5), 0.25e-3
-    geometry = Duct(
-        length_m=length,
-        loudspeaker_m=speaker,
-        error_m=error,
-        reflection=(r0, r1),
-        attenuation_db_per_m=0.0,
-        loudspeaker_resonance_hz=None,
-    )
-    duct = duct_paths(geometry)
+    lossless = {"attenuation_db_per_m": 0.0, "loudspeaker_resonance_hz": None, "reflection": (r0, r1)}
+    duct = duct_paths(Duct(length_m=length, loudspeaker_m=speaker, error_m=error, **lossless))
     # Every image by itself, summed at frequencies in the flat part of the band limit.
     f = np.linspace(50, 6000, 400)
     total = np.zeros(f.size, complex)
@@ -126,26 +119,22 @@ def test_loudspeaker_is_a_second_order_high_pass(fs):
     [
         ({"error_m": 3.0}, r"positions must satisfy .* error_m = 3"),
         ({"loudspeaker_m": 0.1}, "positions must satisfy"),
-        ({"loudspeaker_m": 1.9}, "loudspeaker_m < error_m"),
         ({"source_m": -0.1}, "positions must satisfy"),
         ({"reflection": (1.0, 0.5)}, "reflection must lie strictly between -1 and 1"),
         ({"reflection": 0.5}, "reflection must be a pair"),
-        ({"attenuation_db_per_m": -1.0}, "attenuation_db_per_m must not be negative"),
-        ({"electronics_delay_s": -1.0}, "electronics_delay_s must not be negative"),
-        ({"loudspeaker_resonance_hz": 0.0}, "loudspeaker_resonance_hz must be greater than 0"),
-        ({"loudspeaker_q": 0.0}, "loudspeaker_q must be greater than 0"),
-        ({"speed_of_sound": 0.0}, "speed_of_sound must be greater than 0"),
         ({"length_m": 0.0}, "length_m must be greater than 0"),
-        ({"secondary_taps": 128}, r"secondary_taps = 128 leaves out .* more than -40 dB; .* takes 640"),
         ({"reflection": (0.999, 0.999), "attenuation_db_per_m": 0.0}, "the response rings too long"),
         ({"error_m": 1.4001, "electronics_delay_s": 0.0}, "rings before time zero"),
-        ({"primary_taps": 0}, "primary_taps must be at least 1"),
     ],
 )
 def test_duct_refuses(arguments, message):
-    taps = {name: arguments.pop(name) for name in ("primary_taps", "secondary_taps") if name in arguments}
     with pytest.raises(ValueError, match=message):
-        duct_paths(Duct(**arguments), **taps)
+        duct_paths(Duct(**arguments))
+
+
+def test_too_few_taps_are_refused_with_their_number():
+    with pytest.raises(ValueError, match=r"secondary_taps = 128 leaves out .* more than -40 dB; .* takes 640"):
+        duct_paths(secondary_taps=128)
 
 
 def test_anechoic_end_leaves_no_resonance():

@@ -2,7 +2,6 @@
 
 import tracemalloc
 
-import control
 import numpy as np
 import pytest
 import scipy.signal
@@ -19,17 +18,6 @@ from kfopc_filterpy.paths.uncertainty import path_uncertainty
 
 FS = 16000.0
 PATH = bandpass_path(32)
-
-
-@pytest.mark.parametrize("excitation", ["white", "sweep"])
-def test_noiseless_identification_is_exact(excitation):
-    result = identify_secondary_path(PATH, n_taps=40, duration_s=1.0, rng=0, excitation=excitation, regularization=0.0)
-    # The sweep excites the lowest frequencies 500 times as much as the highest: digits lost.
-    assert result.misalignment_db < (-250 if excitation == "white" else -150)
-    assert np.all(result.modelling_error_db < -100)
-    assert isinstance(result.estimate, control.TransferFunction)
-    assert result.estimate.dt == 1 / FS
-    np.testing.assert_array_equal(path_taps(result.estimate), result.taps)
 
 
 @pytest.mark.parametrize(("n_loudspeakers", "n_samples"), [(1, 7000), (2, 12000)])
@@ -62,18 +50,6 @@ def test_30_000_taps_take_no_matrix():
         estimate_path(x, x, n_taps, FS, regularization=0)
 
 
-def test_estimate_of_a_recording_is_dense_least_squares():
-    rng = np.random.default_rng(3)
-    sent = scipy.signal.lfilter([1.0], [1.0, -0.5], rng.standard_normal(2000))
-    heard = scipy.signal.lfilter([0.0, 0.5, 0.2, -0.1], 1.0, sent) + 0.05 * rng.standard_normal(2000)
-    rows = np.array([sent[n - 5 : n + 1][::-1] for n in range(5, 2000)])
-    expected = np.linalg.lstsq(rows, heard[5:], rcond=None)[0]
-    found = estimate_path(sent, heard, 6, FS, regularization=0.0)
-    np.testing.assert_allclose(found.taps, expected, atol=1e-12)
-    residual = np.mean((heard[5:] - rows @ expected) ** 2) / np.mean(heard[5:] ** 2)
-    assert found.residual_db == pytest.approx(10 * np.log10(residual))
-
-
 def test_ridge_keeps_what_the_excitation_lacks_from_noise():
     rng = np.random.default_rng(0)
     low = scipy.signal.firwin(129, 2000, fs=FS)
@@ -84,13 +60,6 @@ def test_ridge_keeps_what_the_excitation_lacks_from_noise():
     assert np.linalg.norm(ridge.taps) < 2 * np.linalg.norm(path_taps(PATH)) < np.linalg.norm(plain.taps)
     in_band = modelling_error_db(PATH, ridge.estimate, np.linspace(200, 1500, 50))
     assert np.all(in_band < -20)
-
-
-def test_runs_repeat_with_their_seed():
-    first, second = (
-        identify_secondary_path(PATH, n_taps=32, duration_s=0.2, rng=7, sensor_noise_std=0.1) for _ in range(2)
-    )
-    np.testing.assert_array_equal(first.taps, second.taps)
 
 
 def test_frequencies_of_the_error_can_be_chosen():
@@ -108,24 +77,24 @@ def test_error_measures_have_floors_and_lengths():
     assert misalignment_db([3.0, 4.0], [3.0]) == pytest.approx(10 * np.log10(16 / 25))
     np.testing.assert_array_equal(modelling_error_db(PATH, PATH, [100.0]), [-300.0])
     np.testing.assert_array_equal(modelling_error_db([1.0, -1.0], [1.0, 1.0], [0.0], fs=FS), [300.0])
+    with pytest.raises(ValueError, match="path must not be all zeros"):
+        misalignment_db([0.0], [1.0])
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rng": 0, "excitation": "pink"}, "excitation must be one of 'white', 'sweep'"),
-        ({"rng": 0, "duration_s": 0.001}, "duration_s must be at least 0.00394 s for 32 taps"),
-        ({"rng": 0, "level": 0.0}, "level must be greater than 0"),
-        ({"rng": 0, "sensor_noise_std": -1.0}, "sensor_noise_std must not be negative"),
-        ({"rng": 0, "regularization": -1.0}, "regularization must not be negative"),
-        ({"rng": 0, "fs": 8000.0}, "secondary_path is sampled at 16000 Hz"),
-        ({"rng": 0, "amplifier": lambda u: u[:-1]}, r"amplifier\(excitation\) must have 1600 values"),
-        ({"rng": 0, "amplifier": lambda u: 0 * u}, "response must not be silent"),
+        ({"excitation": "pink"}, "excitation must be one of 'white', 'sweep'"),
+        ({"duration_s": 0.001}, "duration_s must be at least 0.00394 s for 32 taps"),
+        ({"level": 0.0}, "level must be greater than 0"),
+        ({"fs": 8000.0}, "secondary_path is sampled at 16000 Hz"),
+        ({"amplifier": lambda u: u[:-1]}, r"amplifier\(excitation\) must have 1600 values"),
+        ({"amplifier": lambda u: 0 * u}, "response must not be silent"),
     ],
 )
 def test_identification_refuses(changes, message):
     with pytest.raises(ValueError, match=message):
-        identify_secondary_path(PATH, **{"n_taps": 32, "duration_s": 0.1, **changes})
+        identify_secondary_path(PATH, **{"n_taps": 32, "duration_s": 0.1, "rng": 0, **changes})
 
 
 @pytest.mark.parametrize(
@@ -134,17 +103,11 @@ def test_identification_refuses(changes, message):
         (np.ones(10), np.ones(9), "response must have 10 samples"),
         (np.ones(4), np.ones(4), "excitation must have at least 7"),
         (np.zeros(10), np.ones(10), "excitation must not be silent"),
-        (np.ones(10), np.zeros(10), "response must not be silent"),
     ],
 )
 def test_estimate_refuses(sent, heard, message):
     with pytest.raises(ValueError, match=message):
         estimate_path(sent, heard, 4, FS)
-
-
-def test_misalignment_refuses_a_silent_path():
-    with pytest.raises(ValueError, match="path must not be all zeros"):
-        misalignment_db([0.0], [1.0])
 
 
 @pytest.mark.parametrize(("excitation", "peak"), [("white", 20.0), ("sweep", np.sqrt(2) * 2.0)])

@@ -68,12 +68,8 @@ def test_the_residual_holds_on_another_recording_of_the_same_noise_and_not_of_an
         (lambda p, v: identify_observation_filters(p[:, :16], v[:, :16], TAPS), "physical must have at least 17"),
         (lambda p, v: identify_observation_filters(0 * p, v, TAPS), r"physical\[0\] must not be silent"),
         (lambda p, v: identify_observation_filters(p, v * [[1], [0]], TAPS), r"virtual\[1\] must not be silent"),
-        (lambda p, v: identify_observation_filters(p, np.inf * v, TAPS), "virtual must be finite"),
-        (lambda p, v: identify_observation_filters(p, v, 0), "n_taps must be at least 1"),
-        (lambda p, v: identify_observation_filters(p, v, TAPS, regularization=-1.0), "regularization must not be neg"),
         (lambda p, v: ObservationFilters(np.ones((1, 3, 2)), np.ones(1)).predict(p), "physical must have 3 channels"),
     ],
-    ids=range(8),
 )
 def test_recordings_that_do_not_fit_are_refused(call: Callable[..., Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
@@ -125,11 +121,8 @@ def test_a_smaller_model_is_as_far_off_as_it_says_and_within_the_bound_of_balanc
     ("paths", "order", "message"),
     [
         (PATHS, 21, r"order must be at most 20 for paths of shape \(4, 2, 10\), got 21"),
-        (PATHS, 0, "order must be at least 1"),
         (0.0 * PATHS, 2, "a tap other than the first"),
-        (PATHS * np.nan, 2, "paths must be finite"),
     ],
-    ids=["large", "none", "silent", "nan"],
 )
 def test_models_that_cannot_be_are_refused(paths: np.ndarray, order: int, message: str) -> None:
     with pytest.raises(ValueError, match=message):

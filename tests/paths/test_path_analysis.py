@@ -74,30 +74,20 @@ def _arriving(samples, n_taps=64):
     ("call", "message"),
     [
         (lambda: frequency_response([1.0], [9000.0], fs=FS), "frequencies_hz must lie within 0 to fs/2"),
-        (lambda: frequency_response([1.0], [-1.0], fs=FS), "frequencies_hz must lie within"),
-        (lambda: frequency_response([1.0], [100.0]), "fs must be given if path is a tap array"),
-        (lambda: group_delay([1.0], [], fs=FS), "frequencies_hz must have at least 1"),
         (lambda: phase_error([1.0], bandpass_path(32), [100.0], fs=8000.0), "estimate is sampled at 16000"),
         (lambda: achieved_band([1.0], 3.0, fs=FS), "level_db must be negative"),
-        (lambda: achieved_band([0.0], fs=FS), "path must not be all zeros"),
         (lambda: secondary_path_gain([1.0], band=(1.0, 2.0), reference=[1.0]), "exclude each other"),
         (lambda: secondary_path_gain([1.0], band=(1.0, 2.0)), "fs must be given"),
         (lambda: secondary_path_gain([1.0, 1.0], reference=[1.0]), "reference must have at least 2"),
-        (lambda: secondary_path_gain([1.0], reference=[0.0, 0.0]), "reference must not be silent"),
-        (lambda: secondary_path_gain([1.0], band=(9.0, 1.0), fs=FS), "band must satisfy"),
-        (lambda: causality_margin([0.0], [1.0], fs=FS), "primary must not be silent"),
-        (lambda: causality_margin([1.0], [0.0], fs=FS), "secondary must not be silent"),
         (lambda: causality_margin([1.0], [1.0], fs=FS, onset_share=1.0), "onset_share must be below 1"),
         (lambda: causality_margin([1.0], bandpass_path(32), fs=8000.0), "secondary is sampled at 16000"),
         (lambda: causality_margin(_iir()[2], [1.0], fs=FS), "primary has an infinite impulse response"),
         (lambda: causality_margin(_arriving([[9]]), _arriving([[2], [3]]), fs=FS), "the same K microphones .* 1 and 2"),
-        (lambda: causality_margin(_arriving([[9]]), _arriving([[2]])), "fs must be given if primary is a tap array"),
         (
             lambda: causality_margin(_arriving([[9], [-1]]), _arriving([[2], [3]]), fs=FS),
             r"primary\[1\] must not be silent",
         ),
         (lambda: causality_margin(_arriving([[9]]), _arriving([[-1, -1]]), fs=FS), "secondary must not be silent"),
-        (lambda: causality_margin(_arriving([[9]]), np.ones((1, 8)), fs=FS), r"secondary must have shape \(K micro"),
     ],
 )
 def test_analysis_refuses(call, message):
@@ -114,6 +104,7 @@ def test_causality_margin_of_delays_is_their_difference(primary, secondary, gain
     assert margin.margin_samples == pytest.approx(primary - secondary, abs=1e-9)
     assert margin.group_delay_margin_samples == pytest.approx(primary - secondary, abs=1e-9)
     assert margin.margin_s == pytest.approx((primary - secondary) / FS, abs=1e-12)
+    assert (margin.margins_s.tolist(), margin.deciding_pair) == ([[margin.margin_s]], (0, 0))
 
 
 @given(taps=TAPS, low=st.floats(0, 3000), width=st.floats(10, 5000))
@@ -181,19 +172,16 @@ def test_margins_of_several_channels_are_those_of_their_pairs():
     primary = np.pad(primary, [(0, 0), (0, 0), (40, 0)])
     secondary = rng.standard_normal((3, 4, 90)) * np.exp(-np.abs(np.arange(90) - rng.integers(5, 30, (3, 4, 1))))
     margin = causality_margin(primary, secondary, fs=FS, band=(200.0, 3000.0))
+
+    def pairs(k, j):
+        return [causality_margin(p, secondary[k, j], fs=FS, band=(200.0, 3000.0)) for p in primary[k]]
+
     for of_pairs, of_pair in (("margins_s", "margin_s"), ("group_delay_margins_s", "group_delay_margin_s")):
-        pairs = np.array(
-            [
-                [
-                    [getattr(causality_margin(p, s, fs=FS, band=(200.0, 3000.0)), of_pair) for p in primary[k]]
-                    for s in secondary[k]
-                ]
-                for k in range(3)
-            ]
-        ).min(axis=2)  # of the reference that arrives first
-        np.testing.assert_allclose(getattr(margin, of_pairs), pairs, atol=1e-15)
+        # Of the reference that arrives first.
+        least = np.array([[min(getattr(m, of_pair) for m in pairs(k, j)) for j in range(4)] for k in range(3)])
+        np.testing.assert_allclose(getattr(margin, of_pairs), least, atol=1e-15)
         # At each microphone the best loudspeaker, and of these the worst.
-        assert getattr(margin, of_pair) == pytest.approx(min(max(row) for row in pairs.tolist()), abs=1e-15)
+        assert getattr(margin, of_pair) == pytest.approx(least.max(axis=1).min(), abs=1e-15)
     assert margin.margins_s[margin.deciding_pair] == margin.margin_s
     assert margin.margin_samples == margin.margin_s * FS
 
@@ -217,15 +205,6 @@ def test_an_unplugged_loudspeaker_does_not_decide_the_margin():
     assert margin.group_delay_margin_samples == pytest.approx(-8)
     assert margin.deciding_pair == (1, 1)
     assert repr(margin) == "<CausalityMargin of 2 microphone(s) and 2 loudspeaker(s): -0.5 ms, -8 samples>"
-
-
-def test_a_single_pair_has_its_margin_as_a_matrix_too():
-    margin = causality_margin(_arriving(20), _arriving(4), fs=FS)
-    assert margin.margins_s.tolist() == [[margin.margin_s]]
-    assert margin.deciding_pair == (0, 0)
-    assert isinstance(margin.margin_s, float)
-    as_matrix = causality_margin(_arriving([[20]]), _arriving(4), fs=FS)
-    assert as_matrix.margin_s == margin.margin_s
 
 
 @pytest.mark.parametrize("n_taps", [3, 64, 70_000])  # the last is longer than the grid's period of 65536

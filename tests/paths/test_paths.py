@@ -15,42 +15,34 @@ from kfopc_filterpy.paths.models import bandpass_path, fir_path, path_taps, pert
 FS = 16000.0
 
 
-@pytest.mark.parametrize("n_taps", [32, 128])
-def test_bandpass_is_the_papers_fir_design(n_taps):
-    path = bandpass_path(n_taps)
+@pytest.mark.parametrize(
+    ("n_taps", "band", "fs", "window", "pass_zero"),
+    [
+        (32, (20.0, 5000.0), 16000.0, "hamming", False),  # the paper's designs
+        (128, (20.0, 5000.0), 16000.0, "hamming", False),
+        (65, (0.0, 1000.0), 8000.0, "hann", True),
+        (65, (1000.0, 3500.0), 8000.0, ("kaiser", 6.0), False),
+        (65, (1000.0, 4000.0), 8000.0, "hamming", "highpass"),
+    ],
+)
+def test_bandpass_is_a_fir_design_by_its_window(n_taps, band, fs, window, pass_zero):
+    path = bandpass_path(n_taps) if fs == FS else bandpass_path(n_taps, band, fs=fs, window=window)
     assert isinstance(path, control.TransferFunction)
-    assert path.dt == 1 / FS
-    expected = scipy.signal.firwin(n_taps, [20, 5000], fs=FS, pass_zero=False)
+    assert path.dt == 1 / fs
+    edges = [edge for edge in band if 0 < edge < fs / 2]
+    expected = scipy.signal.firwin(n_taps, edges, window=window, pass_zero=pass_zero, fs=fs)
     # The same design; python-control divides by a denominator of 1, which is exact.
     np.testing.assert_array_equal(path_taps(path), expected)
 
 
 @pytest.mark.parametrize(
-    ("n_taps", "band", "window", "pass_zero"),
-    [
-        (65, (0.0, 1000.0), "hann", True),
-        (65, (1000.0, 3500.0), ("kaiser", 6.0), False),
-        (64, (300.0, 3000.0), "blackman", False),
-        (65, (1000.0, 4000.0), "hamming", "highpass"),
-    ],
-)
-def test_any_band_length_and_window(n_taps, band, window, pass_zero):
-    taps = path_taps(bandpass_path(n_taps, band, fs=8000.0, window=window))
-    edges = [edge for edge in band if 0 < edge < 4000]
-    expected = scipy.signal.firwin(n_taps, edges, window=window, pass_zero=pass_zero, fs=8000.0)
-    np.testing.assert_allclose(taps, expected, atol=1e-16)
-
-
-@pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"n_taps": 2}, "n_taps must be at least 3, got 2"),
         ({"n_taps": 32, "band": (100.0, 9000.0)}, r"band must satisfy .* fs/2 = 8000 Hz"),
         ({"n_taps": 32, "band": 100.0}, "band must be a pair"),
         ({"n_taps": 32, "band": (0.0, 8000.0)}, "use fir_path"),
         ({"n_taps": 32, "band": (100.0, 8000.0)}, "n_taps must be odd .* use 33"),
         ({"n_taps": 32, "window": "no such"}, "window must be one that"),
-        ({"n_taps": 32, "fs": -1.0}, "fs must be greater than 0"),
     ],
 )
 def test_bandpass_refuses(arguments, message):
@@ -90,8 +82,8 @@ def test_taps_of_an_array_need_no_python_control():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def _iir():
-    numerator, denominator = scipy.signal.butter(3, [500, 3000], "band", fs=FS)
+def _iir(order=3, low=500, high=3000):
+    numerator, denominator = scipy.signal.butter(order, [low, high], "band", fs=FS)
     return numerator, denominator, control.TransferFunction(numerator, denominator, 1 / FS)
 
 
@@ -126,16 +118,13 @@ def test_a_state_space_with_a_finite_response_is_exact(matrices, expected):
         (bandpass_path(32), {"fs": 8000.0}, "path is sampled at 16000 Hz but fs is 8000 Hz"),
         (control.TransferFunction([1.0], [1.0, 2.0]), {}, "discrete-time .* got dt = 0"),
         (control.TransferFunction([1.0], [1.0, 0.2], True), {}, "got dt = True"),
-        (control.TransferFunction([1.0], [1.0]), {}, "got dt = None"),
         (control.StateSpace(np.eye(2) / 2, np.eye(2), np.eye(2), np.zeros((2, 2)), 1 / FS), {}, "one input"),
         (_iir()[2], {}, "n_taps must be given"),
         (_iir()[2], {"n_taps": 8}, "n_taps = 8 cuts off .* not decayed"),
         (control.TransferFunction([1.0, 0.0], [1.0, -1.01], 1 / FS), {"n_taps": 8}, "pole of magnitude 1.01"),
         (control.TransferFunction([1.0, 0.0, 0.0], [1.0, -0.5], 1 / FS), {"n_taps": 8}, "causal"),
+        (_iir(12, 20, 5000)[2], {"n_taps": 4096}, "second-order sections"),  # unstable by rounding
         ([1.0, 1.0, 1.0], {"n_taps": 2}, "cuts off -4.8 dB"),
-        ([1.0, np.nan], {}, "path must be finite"),
-        (np.ones((2, 2)), {}, "path must be one-dimensional"),
-        ([1.0], {"n_taps": 0}, "n_taps must be at least 1"),
     ],
 )
 def test_path_taps_refuses(path, arguments, message):
@@ -151,13 +140,6 @@ def test_path_taps_refuses_measured_responses_and_names_the_argument():
         sampling_rate([1.0])
     with pytest.raises(ValueError, match="taps must not all be zero"):
         fir_path([0.0, 0.0], FS)
-
-
-def test_high_order_transfer_function_is_caught_as_unstable():
-    numerator, denominator = scipy.signal.butter(12, [20, 5000], "band", fs=FS)
-    path = control.TransferFunction(numerator, denominator, 1 / FS)
-    with pytest.raises(ValueError, match="second-order sections"):
-        path_taps(path, n_taps=4096)
 
 
 @given(gain_db=st.floats(-40, 40), delay=st.integers(0, 20), flip=st.booleans())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 from helpers.files import FS, rew_text, write_sofa, write_uff
@@ -13,35 +11,17 @@ from kfopc_filterpy.paths.duct import Duct, duct_paths
 from kfopc_filterpy.signals import read_recording, write_wav
 
 
-def test_a_path_at_another_rate_keeps_its_response_and_a_recording_its_height(tmp_path):
-    taps = path_taps(duct_paths(Duct(), fs=48000).secondary)
-    write_wav(tmp_path / "s.wav", taps, 48000)
-    path = read_path(tmp_path / "s.wav", fs=16000, unit="Pa/V", unit_per_full_scale=0.14)
-    assert (path.fs, path.file_fs, path.unit) == (16000, 48000, "Pa/V")
-    np.testing.assert_array_equal(
-        path.samples, resample_path(0.14 * taps.astype(np.float32).astype(float), 16000, fs=48000)
-    )
-    frequencies = np.linspace(50, 6000, 50)
-    before, after = (
-        frequency_response(h, frequencies, fs=fs) for h, fs in ((0.14 * taps, 48000), (path.samples, 16000))
-    )
-    assert np.max(np.abs(after - before)) < 0.01 * np.max(np.abs(before))
+def test_a_path_at_another_rate_is_resampled_as_a_path_and_a_recording_keeps_its_height(tmp_path):
+    taps = path_taps(duct_paths(Duct(), fs=48000).secondary).astype(np.float32).astype(float)
+    write_wav(tmp_path / "s.wav", [taps, -0.5 * taps], 48000)
+    both = read_path(tmp_path / "s.wav", fs=16000, unit="Pa/V", unit_per_full_scale=0.14)
+    assert (both.fs, both.file_fs, both.unit) == (16000, 48000, "Pa/V")
+    slow = resample_path(0.14 * taps, 16000, fs=48000)
+    np.testing.assert_allclose(both.samples, [slow, -0.5 * slow], rtol=1e-12, atol=1e-15)
     # Read as a recording, it keeps its height instead, and is three times too weak.
-    recording = read_recording(tmp_path / "s.wav", fs=16000)
-    weaker = frequency_response(recording.samples, frequencies, fs=16000) * 0.14
-    assert np.max(np.abs(3 * weaker - after)) < 0.01 * np.max(np.abs(before))
-
-
-def test_two_channels_of_paths_are_resampled_each(tmp_path):
-    taps = np.zeros((2, 400))
-    taps[0, 100], taps[1, 200] = 0.5, -0.25
-    write_wav(tmp_path / "s.wav", taps, 48000)
-    both = read_path(tmp_path / "s.wav", fs=16000)
-    for channel in (0, 1):
-        np.testing.assert_array_equal(both.samples[channel], resample_path(taps[channel], 16000, fs=48000))
-        np.testing.assert_array_equal(
-            read_path(tmp_path / "s.wav", fs=16000, channel=channel).samples, both.samples[channel]
-        )
+    recording = read_recording(tmp_path / "s.wav", fs=16000, channel=0)
+    weaker, right = (frequency_response(h, np.linspace(50, 6000, 50), fs=16000) for h in (recording.samples, slow))
+    assert np.max(np.abs(3 * 0.14 * weaker - right)) < 0.01 * np.max(np.abs(right))
 
 
 # ---- time zero
@@ -69,20 +49,27 @@ def test_rew_begins_at_time_zero(tmp_path):
     assert read_recording(centred).samples.size == 200  # of a recording, the time of its first sample does not matter
 
 
-def test_rew_normalised_is_undone_and_minimum_phase_refused(tmp_path):
-    taps = np.array([0.0, 0.0, 1.0, -0.5])
-    normalised = ("* IR is not normalised", "* IR is normalised")
-    assert read_path(rew(tmp_path, taps, changes=normalised)).samples.tolist() == [0.0, 0.0, 0.25, -0.125]
-    with pytest.raises(ValueError, match=r"rew\.txt is REW's minimum-phase version, which has lost the path's delay"):
-        read_path(rew(tmp_path, taps, changes=("IR is not the min phase", "IR is the min phase")))
-    with pytest.raises(ValueError, match=r"rew\.txt is an export of REW without Sample interval in its header"):
-        read_path(rew(tmp_path, taps, changes=("// Sample interval", "// something")))
-    with pytest.raises(ValueError, match=r"rew\.txt is damaged or cut short: its header claims 5 samples, got \(4,\)"):
-        read_path(rew(tmp_path, taps, changes=("4 // Response length", "5 // Response length")))
-    with pytest.raises(ValueError, match=r"rew\.txt states a sample interval of 0 s"):
-        read_path(rew(tmp_path, taps, changes=(f"{1 / FS!r} // Sample", "0 // Sample")))
-    with pytest.raises(ValueError, match=r"rew\.txt has .* bytes, but with its start time it has 1.6e\+13 samples"):
-        read_path(rew(tmp_path, taps, start_s=1e9))
+def test_rew_normalised_is_undone(tmp_path):
+    normalised = rew(tmp_path, [0.0, 0.0, 1.0, -0.5], changes=("* IR is not normalised", "* IR is normalised"))
+    assert read_path(normalised).samples.tolist() == [0.0, 0.0, 0.25, -0.125]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (
+            {"changes": ("IR is not the min phase", "IR is the min phase")},
+            "is REW's minimum-phase version, which has lost",
+        ),
+        ({"changes": ("// Sample interval", "// something")}, "is an export of REW without Sample interval"),
+        ({"changes": ("4 // Response length", "5 // Response length")}, r"its header claims 5 samples, got \(4,\)"),
+        ({"changes": (f"{1 / FS!r} // Sample", "0 // Sample")}, "states a sample interval of 0 s"),
+        ({"start_s": 1e9}, r"has .* bytes, but with its start time it has 1.6e\+13 samples"),
+    ],
+)
+def test_rew_without_what_a_path_needs_is_refused(changed, message, tmp_path):
+    with pytest.raises(ValueError, match=rf"rew\.txt .*{message}"):
+        read_path(rew(tmp_path, [0.0, 0.0, 1.0, -0.5], **changed))
 
 
 def test_times_in_text_and_uff_shift_a_path_too(tmp_path):
@@ -97,53 +84,45 @@ def test_times_in_text_and_uff_shift_a_path_too(tmp_path):
 # ---- matrices
 
 
-def test_sofa_has_receivers_before_sources_and_its_delays(tmp_path):
-    responses = np.random.default_rng(3).standard_normal((3, 2, 40))  # (measurements, receivers, taps)
+@pytest.mark.parametrize("loudspeakers", ["measurements", "emitters"])
+def test_sofa_has_receivers_before_sources_and_its_delays(loudspeakers, tmp_path):
+    wanted = np.random.default_rng(3).standard_normal((2, 3, 40))  # (receivers, loudspeakers, taps)
+    delays = np.array([[0.0, 1.0, 5.0], [2.0, 0.0, 3.0]])
+    if loudspeakers == "measurements":
+        responses, delay = wanted.swapaxes(0, 1), delays.T
+    else:
+        responses, delay = wanted.swapaxes(1, 2)[np.newaxis], delays[np.newaxis]
     write_sofa(tmp_path / "x.sofa", responses)
     paths = read_path(tmp_path / "x.sofa")
-    np.testing.assert_array_equal(paths.samples, responses.swapaxes(0, 1))
+    np.testing.assert_array_equal(paths.samples, wanted)
     assert paths.fs == FS
     assert "2 x 3 x 40 samples" in repr(paths)
-    delays = np.array([[0.0, 2.0], [1.0, 0.0], [5.0, 3.0]])
-    write_sofa(tmp_path / "x.sofa", responses, delay=delays)
+    write_sofa(tmp_path / "x.sofa", responses, delay=delay)
     late = read_path(tmp_path / "x.sofa").samples
     assert late.shape == (2, 3, 45)
-    for m in range(3):
-        for r in range(2):
-            begin = int(delays[m, r])
-            np.testing.assert_array_equal(late[r, m, begin : begin + 40], responses[m, r])
-            assert np.count_nonzero(late[r, m]) == 40
+    for place, begin in np.ndenumerate(delays.astype(int)):
+        np.testing.assert_array_equal(late[place][begin : begin + 40], wanted[place])
+        assert np.count_nonzero(late[place]) == 40
+
+
+def test_sofa_of_one_path_and_what_it_may_not_be(tmp_path):
+    responses = np.random.default_rng(3).standard_normal((1, 1, 40))
+    write_sofa(tmp_path / "x.sofa", responses)
+    assert read_path(tmp_path / "x.sofa").samples.shape == (40,)
     write_sofa(tmp_path / "x.sofa", responses, delay=0.5)
     with pytest.raises(ValueError, match=r"x\.sofa has delays that are no whole numbers of samples"):
         read_path(tmp_path / "x.sofa")
-    write_sofa(tmp_path / "x.sofa", responses[:1, :1])
-    assert read_path(tmp_path / "x.sofa").samples.shape == (40,)
-
-
-def test_sofa_of_several_emitters_has_them_as_loudspeakers(tmp_path):
-    responses = np.random.default_rng(3).standard_normal((1, 2, 40, 3))  # (measurements, receivers, taps, emitters)
-    delays = np.arange(6.0).reshape(1, 2, 3)
-    write_sofa(tmp_path / "x.sofa", responses, delay=delays)
-    paths = read_path(tmp_path / "x.sofa").samples
-    assert paths.shape == (2, 3, 45)
-    for r in range(2):
-        for e in range(3):
-            begin = int(delays[0, r, e])
-            np.testing.assert_array_equal(paths[r, e, begin : begin + 40], responses[0, r, :, e])
-            assert np.count_nonzero(paths[r, e]) == 40
-    write_sofa(tmp_path / "x.sofa", np.repeat(responses, 2, axis=0))
+    write_sofa(tmp_path / "x.sofa", np.ones((2, 2, 40, 3)))
     with pytest.raises(ValueError, match=r"x\.sofa has several emitters in each of 2 measurements, expected one"):
         read_path(tmp_path / "x.sofa")
 
 
 def test_a_matrix_of_taps_keeps_its_axes_and_has_no_channels(tmp_path):
     taps = np.random.default_rng(3).standard_normal((2, 3, 40))
-    taps[..., :12] = 0.0
     np.save(tmp_path / "x.npy", taps)
-    np.testing.assert_array_equal(read_path(tmp_path / "x.npy", fs=FS).samples, taps)
-    slower = read_path(tmp_path / "x.npy", fs=FS, file_fs=FS)
-    np.testing.assert_array_equal(slower.samples, taps)
-    with pytest.raises(ValueError, match=re.escape("x.npy holds a matrix of paths, (2, 3, 40), and no channels")):
+    for rates in ({"fs": FS}, {"fs": FS, "file_fs": FS}):
+        np.testing.assert_array_equal(read_path(tmp_path / "x.npy", **rates).samples, taps)
+    with pytest.raises(ValueError, match=r"x\.npy holds a matrix of paths, \(2, 3, 40\), and no channels"):
         read_path(tmp_path / "x.npy", fs=FS, channel=0)
 
 

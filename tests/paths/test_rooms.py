@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from kfopc_filterpy.paths import causality_margin, group_delay, horizontal_plane, room_paths
+from kfopc_filterpy.paths import group_delay, horizontal_plane, room_paths
 
 SIZE = np.array([5.0, 4.0, 2.5])
 FS, C = 16000.0, 343.0
@@ -100,19 +100,6 @@ def test_the_decay_is_sabines_within_what_the_docstring_says(pra, reverberation_
 
 
 @needs_rooms
-def test_margin_is_the_difference_of_the_distances():
-    paths = room_paths(SIZE, **PLACES, absorption=1.0)
-    for k, microphone in enumerate(MICROPHONES):
-        for j, loudspeaker in enumerate(LOUDSPEAKERS):
-            travelled = np.linalg.norm(np.subtract(microphone, SOURCE)) - np.linalg.norm(
-                np.subtract(microphone, loudspeaker)
-            )
-            margin = causality_margin(paths.primary[k, 0], paths.secondary[k, j], fs=FS, band=(0.0, 0.35 * FS))
-            assert margin.margin_samples == pytest.approx(travelled / C * FS, abs=3)  # pulses of 10 samples each side
-            assert margin.group_delay_margin_samples == pytest.approx(travelled / C * FS, abs=0.01)
-
-
-@needs_rooms
 def test_speed_of_sound_and_sampling_rate_scale_the_arrivals():
     places = {**PLACES, "loudspeakers_m": LOUDSPEAKERS[0], "microphones_m": MICROPHONES[0]}
     r = np.linalg.norm(np.subtract(LOUDSPEAKERS[0], MICROPHONES[0]))
@@ -155,13 +142,8 @@ def test_horizontal_plane_fills_the_room():
     ("changes", "message"),
     [
         ({"size_m": [5.0, 4.0]}, r"size_m must be \(length, width, height\) in m, got shape \(2,\)"),
-        ({"size_m": [5.0, -4.0, 2.5]}, "size_m must be greater than 0 m in every direction"),
-        ({"size_m": [5.0, np.nan, 2.5]}, "size_m must be finite"),
         ({"sources_m": [[1.0, 2.0]]}, r"sources_m must be x, y, z in m for each, shape \(n, 3\), got \(1, 2\)"),
-        ({"sources_m": np.zeros((0, 3))}, "sources_m must be x, y, z in m for each"),
-        ({"sources_m": [1.0, np.inf, 1.0]}, "sources_m must be finite"),
         ({"loudspeakers_m": [[1, 1, 1], [5.5, 1, 1]]}, r"loudspeakers_m\[1\] = \[5.5, 1.0, 1.0\] m must lie inside"),
-        ({"microphones_m": [1.0, 1.0, 0.0]}, r"microphones_m\[0\] .* must lie inside the room"),
         ({"loudspeakers_m": [[1, 1, 1], [2, 1, 1], [1, 1, 1]]}, r"loudspeakers_m\[2\] .* same position as .*\[0\]"),
         ({"microphones_m": SOURCE}, r"microphones_m\[0\] must not be nearer to sources_m\[0\] than 0.0214 m"),
         (
@@ -169,12 +151,8 @@ def test_horizontal_plane_fills_the_room():
             r"must not be nearer to loudspeakers_m\[1\] than .*0.0173 m",
         ),
         ({"n_taps": 100}, r"n_taps must be at least 185, .* from sources_m\[0\] to microphones_m\[1\] takes, got 100"),
-        ({"n_taps": 0}, "n_taps must be at least 1"),
-        ({"fs": 0.0}, "fs must be greater than 0"),
-        ({"speed_of_sound": -1.0}, "speed_of_sound must be greater than 0"),
         ({"absorption": None}, "give either reverberation_time_s or absorption"),
         ({"reverberation_time_s": 0.2}, "give either reverberation_time_s or absorption"),
-        ({"absorption": None, "reverberation_time_s": 0.0}, "reverberation_time_s must be greater than 0"),
         ({"absorption": None, "reverberation_time_s": 0.05}, "reverberation_time_s must be at least 0.0948 s"),
         ({"absorption": 0.0}, "absorption must be above 0 and at most 1, got 0 for the wall west"),
         ({"absorption": {**UNEVEN, "floor": 1.5}}, "got 1.5 for the wall floor"),

@@ -225,16 +225,11 @@ def test_microphones_that_moved_apart_hear_2_db_more_at_most_from_one_loudspeake
     ("uncertainty", "path", "message"),
     [
         (-0.1, PATH, "secondary_path_uncertainty must"),
-        (np.nan, PATH, "secondary_path_uncertainty must"),
         ([0.1, -0.2], PATH, r"zero or above at two or more frequencies .*; a measured path is \(1, n_taps\)"),
-        ([0.1], PATH, "zero or above at two or more frequencies"),
         ([0.1, np.inf], PATH, "secondary_path_uncertainty"),
-        (np.ones((2, 3, 4, 5)), PATH, r"must be \(M, n_taps\)"),
         (np.ones((2, 4)), np.ones((2, 2, 4)), r"must be \(M, 2, 2, n_taps\)"),
         ("much", PATH, "real numbers, got str; give a PathTolerance, a relative error"),
-        (PathTolerance, PATH, "real numbers, got type; give a PathTolerance, a relative error"),
         ([PathTolerance()], PATH, "real numbers, got list; give a PathTolerance, a relative error"),
-        ([[0.1], [0.1, 0.2]], PATH, "whose rows differ in length; give a PathTolerance"),
     ],
 )
 def test_what_is_refused(uncertainty: Any, path: np.ndarray, message: str) -> None:
@@ -247,10 +242,6 @@ def test_what_is_refused(uncertainty: Any, path: np.ndarray, message: str) -> No
 def test_what_a_tolerance_refuses() -> None:
     with pytest.raises(ValueError, match="delay_samples must not be negative"):
         PathTolerance(delay_samples=-1.0)
-    with pytest.raises(ValueError, match="phase_deg must be finite"):
-        PathTolerance(phase_deg=np.inf)
     with pytest.raises(ValueError, match="gain_db must be at most 20, got 21: a path that is known no better"):
         PathTolerance(gain_db=21.0)
-    with pytest.raises(TypeError, match="gain_db must be a"):
-        PathTolerance(gain_db="3 dB")  # type: ignore[arg-type]
     assert type(PathTolerance(delay_samples=np.array([0.5])).delay_samples) is float  # type: ignore[arg-type]
