@@ -94,17 +94,11 @@ def test_a_divergence_ends_the_run_with_nan() -> None:
     ("changed", "match"),
     [
         ({"primary_path": PRIMARY[:2]}, r"primary_path must be \(K microphones, I references, taps\) with K = 3"),
-        ({"primary_path": PRIMARY.transpose(1, 0, 2)}, r"primary_path must be \(K microphones, I references"),
         ({"secondary_path": np.moveaxis(SECONDARY, 2, 0)}, "taps come last"),
         ({"secondary_path": SECONDARY[0]}, r"must have shape \(K microphones, J loudspeakers, taps\)"),
-        ({"secondary_path": np.where(SECONDARY[0, 0, 2] == SECONDARY, np.nan, SECONDARY)}, "must be finite"),
         ({"primary_path": None, "disturbance": np.zeros((2, N))}, r"disturbance must be \(K microphones, n_samples\)"),
-        ({"disturbance": np.zeros((K, N))}, "not both"),
-        ({"reference": X.T}, "transpose"),
         ({"feedback_path": np.zeros((J + 1, J, 4))}, r"feedback_path must be \(I references, J loudspeakers, taps\)"),
         ({"feedback_path": np.ones((REFERENCES, J, 4))}, "a first tap is 1, not 0"),
-        ({"record_weights_every": 10}, "attribute weights"),
-        ({"switch_on_s": 0.01}, "listen"),
         ({"rated_power": [1.0, 2.0, 3.0]}, "each of the 2 loudspeakers"),
         ({"controller": kf_pb(8, SECONDARY, rated_power=1.0)}, "made for 1 references"),
         ({"controller": FxLMS(8, [1.0], step_size=0.1)}, "one channel"),
@@ -112,7 +106,7 @@ def test_a_divergence_ends_the_run_with_nan() -> None:
         ({"controller": FrequencyDomainFxLMS(8, SECONDARY, step_size=0.1, block_size=4)}, "made for 1 references"),
         ({"controller": StatesItsChannels()}, "made for 5 microphones"),
     ],
-    ids=range(18),
+    ids=range(12),
 )
 def test_shapes_that_do_not_fit_are_refused_by_the_name_of_the_axis(changed: dict, match: str) -> None:
     with pytest.raises(ValueError, match=match):

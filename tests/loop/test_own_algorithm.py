@@ -312,7 +312,6 @@ def test_a_name_that_cannot_be_loaded_is_refused_before_anything_is_compiled(tmp
 FAULTS = {
     "does not compile": ("return ANC_DONE;", "return ANC_FINE;", RuntimeError, r"faulty\.c does not compile:\n(.|\n)*ANC_FINE"),
     "without the symbol": ("anc_own_sign", "anc_other", ValueError, r"defines no algorithm anc_own_sign.*or give the name"),
-    "without a step": ("control_signal, update}", "control_signal}", ValueError, r"anc_own_sign in .* has no update"),
     "without the signals": ("layout_signals(&own->s", "if (0) layout_signals(&own->s", ValueError, "layout_signals first"),
 }  # fmt: skip
 
@@ -330,7 +329,6 @@ def test_a_faulty_file_says_what_to_mend(fault: str, tmp_path: Path) -> None:
     ("entries", "says"),
     [
         ({}, ""),
-        ({"name": None}, "its first entry must be the algorithm's name"),
         ({"settings": []}, "its settings must be an array that ends with {0}, also if there is none"),
         ({"layout": None, "start": None}, "it has no layout and no start; it must be {name, settings, layout, start,"),
         ({"settings": [("a", 0, 0), ("b", 2, 1)]}, "the range of b is from 2 to 1, which is empty"),

@@ -172,7 +172,7 @@ def test_what_is_one_for_all(primary):
 def test_systems_generators_and_other_sequences_one_each():
     x, own = differing(3, 200)
     given = {
-        "secondary_path": [fir_path(s, FS) for s in own["secondary_path"]],
+        "secondary_path": [fir_path(np.trim_zeros(s, "b"), FS) for s in own["secondary_path"]],
         "sensor_noise_std": np.array(own["sensor_noise_std"]),
         "rng": [np.random.default_rng(seed) for seed in own["rng"]],
         "amplifier": tuple(own["amplifier"]),
@@ -180,12 +180,9 @@ def test_systems_generators_and_other_sequences_one_each():
     }
     results, plain = (run_scenarios(filters(3), x, fs=FS, **each) for each in (given, own))
     x[:], own["disturbance"][:] = 0.0, 0.0  # the results are no views of what was given
-    for one, other in zip(results, plain, strict=True):
-        for name in ("reference", "disturbance", "error"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-            assert np.all(getattr(other, name))
-        with pytest.raises(ValueError, match="read-only"):
-            other.error[0] = 0.0
+    assert_as_alone(results, plain)
+    assert np.all(plain[0].reference)
+    assert np.all(plain[0].disturbance)
 
 
 # ---- The controllers afterwards
@@ -235,30 +232,23 @@ def test_an_interrupted_run_leaves_the_controllers_as_they_were():
 def test_a_scenario_that_diverges_leaves_the_others_alone(cause):
     """A true path of the wrong sign; or a disturbance a million times what the amplifier can cancel."""
     count, bad, n = 11, 8, 1500
-    made, alone, healthy = (filters(count, state_noise=1e-2) for _ in range(3))
-    assert made[bad].rated_power is None
+    made, alone = (filters(count, state_noise=1e-2) for _ in range(2))
     x, own = differing(count, n)
     own |= {"amplifier": [HardClipAmplifier(5.0) if cause == "disturbance" else None] * count}
-    own |= {"secondary_path": [np.append(S_HAT, 0.0)] * count}
-    scale = np.where(np.arange(count) == bad, -1.0 if cause == "path" else 1e6, 1.0)[:, None]
-    wrong = "secondary_path" if cause == "path" else "disturbance"
-    given = own | {wrong: list(scale * own[wrong])}
+    own |= {"secondary_path": [np.append(S_HAT, 0.0) for _ in range(count)]}
+    own["secondary_path" if cause == "path" else "disturbance"][bad] *= -1.0 if cause == "path" else 1e6
     options = {"record_powers": True, "rated_power": 1e-4 if cause == "path" else None}  # another limit, an earlier end
-    results = run_scenarios(made, x, fs=FS, **given, **options)
-    expected = one_by_one(alone, x, given, **options)
+    results = run_scenarios(made, x, fs=FS, **own, **options)
     rest = [i for i in range(count) if i != bad]
-    assert_as_alone(results, expected, [made[i] for i in rest], [alone[i] for i in rest])
+    one_each = one_by_one(alone, x, own, **options)
+    assert_as_alone(results, one_each, [made[i] for i in rest], [alone[i] for i in rest])
+    assert [i for i in range(count) if results[i].diverged_at_s is not None] == [bad]
     np.testing.assert_array_equal(made[bad].weights, alone[bad].weights)
     np.testing.assert_array_equal(made[bad].covariance, made[0].covariance)  # that of the end of the run
     end = round(results[bad].diverged_at_s * FS)
     assert 0 < end < n
     for name in ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor", "disturbance_power"):
         np.testing.assert_array_equal(np.isnan(getattr(results[bad], name)), np.arange(n) >= end, err_msg=name)
-    undisturbed = run_scenarios(healthy, x, fs=FS, **own)
-    assert undisturbed[bad].diverged_at_s is None
-    for i in rest:
-        np.testing.assert_array_equal(results[i].error, undisturbed[i].error)
-        np.testing.assert_array_equal(made[i].weights, healthy[i].weights)
 
 
 def test_when_all_have_diverged_the_run_ends():
@@ -273,35 +263,23 @@ def test_when_all_have_diverged_the_run_ends():
     assert sum(counts) == 3 * round(max(ends) * FS)
 
 
-def test_a_disturbance_whose_square_overflows_names_the_scenario_and_the_sample():
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("disturbance", r"too loud.*sample 50 of the run, the loudest error is controllers\[4\]'s"),
+        ("reference", r"the reference is too loud.*\(sample 50 of the run\)"),
+    ],
+)
+def test_a_signal_whose_square_overflows_is_named_with_scenario_and_sample(what, message):
     x, own = differing(9, 300)
-    own["disturbance"][4, 50] = 1e200
+    (own["disturbance"][4] if what == "disturbance" else x)[50] = 1e200
     made, untouched = filters(9), filters(9)
-    with pytest.raises(ValueError, match=r"too loud.*sample 50 of the run, the loudest error is controllers\[4\]'s"):
-        run_scenarios(made, x, fs=FS, **own)
-    assert_untouched(made, untouched)
-
-
-def test_a_reference_that_is_too_loud_is_refused_with_its_reason():
-    x, own = differing(3, 300)
-    x[50] = 1e150
-    made, untouched = filters(3), filters(3)
-    with pytest.raises(ValueError, match=r"the reference is too loud.*\(sample 50 of the run\)"):
+    with pytest.raises(ValueError, match=message):
         run_scenarios(made, x, fs=FS, **own)
     assert_untouched(made, untouched)
 
 
 # ---- What each scenario may have of its own
-
-
-def test_true_paths_of_different_lengths():
-    x, own = differing(3, 200)
-    ragged = [np.trim_zeros(s, "b") for s in own["secondary_path"]]
-    assert len({s.size for s in ragged}) > 1
-    one, other = (
-        run_scenarios(filters(3), x, fs=FS, **own | {"secondary_path": s}) for s in (own["secondary_path"], ragged)
-    )
-    assert_as_alone(other, one)
 
 
 @pytest.mark.parametrize("several", [lambda one: one, lambda one: [one, 1, one]])
@@ -310,14 +288,6 @@ def test_one_generator_for_several_scenarios_is_refused(several):
     x, own = differing(3, 50)
     with pytest.raises(ValueError, match="rng holds one Generator for several controllers"):
         run_scenarios(filters(3), x, fs=FS, **own | {"rng": several(np.random.default_rng(0))})
-
-
-def test_one_controller_that_is_no_list_and_signals_of_different_lengths_are_refused():
-    x, own = differing(3, 50)
-    with pytest.raises(TypeError, match=r"controllers must be a sequence of controllers: \[controller\] for one"):
-        run_scenarios(filters(1)[0], x, fs=FS, **own)
-    with pytest.raises(ValueError, match="disturbance must have 50 values, got 49"):
-        run_scenarios(filters(3), x, fs=FS, **own | {"disturbance": [x, x[:-1], x]})
 
 
 # ---- Refusals
@@ -340,6 +310,7 @@ TWICE = r"controllers\[1\] is in the list twice"
 AGREE = r"controllers\[0\] and controllers\[1\] must agree in "
 REFUSED = [
     (list, ValueError, "controllers must hold one controller at least"),
+    (lambda: filters(1)[0], TypeError, r"controllers must be a sequence of controllers: \[controller\] for one"),
     (
         lambda: [*filters(2), FxLMS(7, S_HAT, step_size=0.1)],
         ValueError,
@@ -355,23 +326,14 @@ REFUSED = [
     (lambda: [KalmanController(KFOPC(7), S)], ValueError, r"controllers\[0\] has steps of its own in Python"),
     (lambda: filters(1) * 3, ValueError, TWICE),
     (lambda: one_of_three(n_taps=6), ValueError, AGREE + "n_taps"),
-    (lambda: one_of_three(state_noise=1e-6), ValueError, AGREE + "state_noise"),
-    (lambda: one_of_three(measurement_noise=0.2), ValueError, AGREE + "measurement_noise"),
-    (lambda: one_of_three(initial_variance=1.0), ValueError, AGREE + "initial_variance"),
     (lambda: one_of_three(secondary=0.9 * S_HAT), ValueError, AGREE + "their estimated secondary path"),
     (lambda: one_of_three(window="sliding"), ValueError, AGREE + "the length of the sliding windows of their powers"),
     (lambda: one_of_three(heard=[-1, 1, 1]), ValueError, HEARD),  # with the same covariance
     ({"amplifier": [None] * 2}, ValueError, "amplifier must be one value or 3, one for each controller, got 2"),
     ({"rng": [1, 2], "sensor_noise_std": 0.1}, ValueError, "rng must be one value or 3"),
-    ({"sensor_noise_std": [0.1] * 4, "rng": 0}, ValueError, "sensor_noise_std must be one value or 3"),
-    ({"disturbance": D[:2]}, ValueError, "disturbance must be one value or 3"),
     ({"disturbance": D[:, :-1]}, ValueError, "disturbance must have 50 values, got 49"),
-    ({"secondary_path": [S, S]}, ValueError, "secondary_path must be one value or 3"),
     ({"amplifier": math.tanh}, TypeError, "amplifier must be one of the package's models or None, .* use simulate"),
-    ({"amplifier": [None, None, abs]}, TypeError, "amplifier must be one of the package's models or None"),
-    ({"reference": np.where(X > 1, np.nan, X)}, ValueError, "reference must be finite"),
     ({"fs": 16000.0}, ValueError, "fs is 16000 Hz but the controller's power memory is for 8000 Hz"),
-    ({"switch_on_s": 50 / FS}, ValueError, "switch_on_s must leave samples to control"),
 ]
 
 
@@ -385,6 +347,6 @@ def test_refused_with_nothing_changed(wrong, kind, message):
     before = copy.deepcopy(made)
     with pytest.raises(kind, match=message):
         run_scenarios(made, **options)
-    assert_untouched(*([c for c in each if hasattr(c, "update")] for each in (made, before)))
+    assert_untouched(*([c for c in np.ravel(each) if hasattr(c, "update")] for each in (made, before)))
     if not callable(wrong):
         run_scenarios(made, X, disturbance=D, secondary_path=S, fs=FS)

@@ -1,12 +1,11 @@
 """`simulate`: what it records, users' own controllers and amplifiers, divergence as a result."""
 
-import dataclasses
 import math
 import sys
 
 import numpy as np
 import pytest
-from helpers.comparing import assert_same_run
+from helpers.comparing import SIGNALS
 from helpers.simulation import MAKERS, D, Integrator, S, X, noises
 
 from kfopc_filterpy import FxLMS, FxNLMS, HardClipAmplifier, KalmanController, SoftSaturationAmplifier, simulate
@@ -17,26 +16,17 @@ from kfopc_filterpy.paths import fir_path
 
 
 def test_the_result():
-    result = simulate(MAKERS["KF-OPC"](), X, disturbance=D, secondary_path=S, fs=16000)
-    for name in ("reference", "disturbance", "error", "control_signal", "amplifier_output", "anti_noise"):
-        assert getattr(result, name).shape == X.shape
-        assert np.all(np.isfinite(getattr(result, name)))
+    x, d = X.copy(), D.copy()
+    result = simulate(MAKERS["KF-OPC"](), x, disturbance=d, secondary_path=S, fs=16000)
+    x[:], d[:] = 0.0, 0.0  # the result is no view of what was given
+    np.testing.assert_array_equal(result.reference, X)
+    np.testing.assert_array_equal(result.disturbance, D)
     np.testing.assert_array_equal(result.error, D - result.anti_noise)
     np.testing.assert_allclose(result.anti_noise, np.convolve(result.amplifier_output, S)[: X.size], atol=1e-14)
     np.testing.assert_array_equal(result.time_s, np.arange(X.size) / 16000)
     assert (result.algorithm, result.rated_power, result.diverged_at_s) == ("KF-OPC", 0.2, None)
     for name in ("weights", "weights_time_s", "disturbance_power", "secondary_path_gain"):
         assert getattr(result, name) is None  # not asked for
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        result.error = D
-
-
-def test_the_result_is_no_view_of_what_was_given():
-    x, d = X.copy(), D.copy()
-    result = simulate(MAKERS["FxLMS"](), x, disturbance=d, secondary_path=S)
-    x[:], d[:] = 0.0, 0.0
-    np.testing.assert_array_equal(result.reference, X)
-    np.testing.assert_array_equal(result.disturbance, D)
 
 
 @pytest.mark.parametrize("every", [1, 7, 299, 300, 1000])
@@ -58,16 +48,11 @@ def test_primary_path_makes_the_disturbance(given):
 
 
 def test_sensor_noise_is_in_the_error_alone():
-    rng = np.random.default_rng(8)
-    result = simulate(
-        MAKERS["FxLMS"](), X, disturbance=D, secondary_path=S, sensor_noise_std=0.3, rng=8, record_powers=True
-    )
+    run = {"disturbance": D, "secondary_path": S, "sensor_noise_std": 0.3}
+    result, again = (simulate(MAKERS["FxLMS"](), X, **run, rng=rng) for rng in (8, np.random.default_rng(8)))
     noise = result.error - (result.disturbance - result.anti_noise)
-    np.testing.assert_allclose(noise, 0.3 * rng.standard_normal(X.size), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(noise, 0.3 * np.random.default_rng(8).standard_normal(X.size), rtol=0, atol=1e-14)
     np.testing.assert_array_equal(result.disturbance, D)
-    again = simulate(
-        MAKERS["FxLMS"](), X, disturbance=D, secondary_path=S, sensor_noise_std=0.3, rng=np.random.default_rng(8)
-    )
     np.testing.assert_array_equal(result.error, again.error)
 
 
@@ -89,13 +74,12 @@ def calls_of_python(function):
 
 def test_built_in_controllers_do_run_compiled():
     x, d = noises(20_000)
+    run = {"disturbance": d, "secondary_path": S}
     for make in MAKERS.values():
         for amplifier in (None, HardClipAmplifier(1.0), SoftSaturationAmplifier(1.0)):
-            options = {"disturbance": d, "secondary_path": S, "amplifier": amplifier, "progress": lambda n: None}
-            assert calls_of_python(lambda: simulate(make(), x, **options)) < x.size / 10  # noqa: B023 - called at once
-    assert (
-        calls_of_python(lambda: simulate(make(), x[:100], disturbance=d[:100], secondary_path=S, compiled=False)) > 100
-    )
+            options = {"amplifier": amplifier, "progress": lambda n: None}
+            assert calls_of_python(lambda: simulate(make(), x, **run, **options)) < x.size / 10  # noqa: B023
+    assert calls_of_python(lambda: simulate(make(), x, **run, compiled=False)) > x.size
 
 
 # ---- Users' own parts
@@ -160,9 +144,6 @@ def test_numpy_scalars_and_one_element_arrays_are_samples():
 def test_a_users_own_amplifier(name):
     result = simulate(MAKERS[name](), X, disturbance=D, secondary_path=S, amplifier=math.tanh)
     np.testing.assert_array_equal(result.amplifier_output, [math.tanh(y) for y in result.control_signal])
-    clip = HardClipAmplifier(0.4)
-    own = simulate(MAKERS[name](), X, disturbance=D, secondary_path=S, amplifier=clip)
-    assert_same_run(own, simulate(MAKERS[name](), X, disturbance=D, secondary_path=S, amplifier=clip))
 
 
 @pytest.mark.parametrize("family", [FxLMS, KalmanController, RandomWalkKFOPC])
@@ -200,24 +181,12 @@ def test_divergence_is_a_result(name, compiled):
         made.constraint.factor = 1.0  # left to eq. 13 it does not diverge, see test_controllers
     run = {"disturbance": d, "secondary_path": S, "fs": 16000, "rated_power": 0.25, "compiled": compiled}
     result = simulate(made, x, record_weights_every=10, record_powers=True, **run)
-    assert result.diverged_at_s is not None
     end = round(result.diverged_at_s * 16000)
     assert 0 < end < 3000
-    assert result.diverged_at_s == end / 16000
-    for signal in (
-        "error",
-        "control_signal",
-        "amplifier_output",
-        "anti_noise",
-        "constraint_factor",
-        "disturbance_power",
-        "secondary_path_gain",
-    ):
-        assert np.all(np.isfinite(getattr(result, signal)[:end])), signal
-        assert np.all(np.isnan(getattr(result, signal)[end:])), signal
-    rows = -(-end // 10)
-    assert np.all(np.isfinite(result.weights[:rows]))
-    assert np.all(np.isnan(result.weights[rows:]))
+    for signal in SIGNALS:
+        last = -(-end // 10) if signal == "weights" else end
+        assert np.all(np.isfinite(getattr(result, signal)[:last])), signal
+        assert np.all(np.isnan(getattr(result, signal)[last:])), signal
     assert np.max(np.abs(result.control_signal[:end])) <= 0.5e6
     np.testing.assert_array_equal(result.disturbance, d)  # what was given stays
     assert simulate(made, x, **run).diverged_at_s is not None  # it goes on from where it is: no exception either

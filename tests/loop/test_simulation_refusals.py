@@ -14,36 +14,19 @@ from kfopc_filterpy.controllers import DirectKalman
 from kfopc_filterpy.paths import fir_path
 
 REFUSED = [
-    ({"reference": X[:0], "disturbance": D[:0]}, ValueError, "reference must have at least 1 value"),
     ({"reference": X[:, None]}, ValueError, "reference must have its channels first"),
-    ({"reference": np.where(X > 2, np.nan, X)}, ValueError, "reference must be finite"),
-    ({"reference": ["a"] * 300}, TypeError, "reference must be a sequence of real numbers"),
-    ({"disturbance": np.where(D > 2, np.inf, D)}, ValueError, "disturbance must be finite"),
     ({"disturbance": D[:-1]}, ValueError, "disturbance must have 300 values, got 299"),
     ({"primary_path": [1.0]}, ValueError, "either primary_path= or disturbance=, not both"),
     ({"disturbance": None}, ValueError, "either primary_path= or disturbance=.* not neither"),
-    ({"disturbance": None, "primary_path": [np.nan]}, ValueError, "primary_path must be finite"),
     ({"secondary_path": []}, ValueError, "secondary_path must have at least 1 value"),
-    ({"secondary_path": [1.0, np.inf]}, ValueError, "secondary_path must be finite"),
     ({"secondary_path": fir_path(S, 8000.0)}, ValueError, "secondary_path is sampled at 8000 Hz but fs is 16000 Hz"),
-    (
-        {"disturbance": None, "primary_path": fir_path(S, 44100.0)},
-        ValueError,
-        "primary_path is sampled at 44100 Hz but fs is 16000 Hz",
-    ),
+    ({"disturbance": None, "primary_path": fir_path(S, 44100.0)}, ValueError, "primary_path is sampled at 44100 Hz"),
     ({"feedback_path": fir_path(S, 8000.0)}, ValueError, "feedback_path is sampled at 8000 Hz"),
     ({"secondary_path": control.TransferFunction([1.0], [1.0, 2.0])}, ValueError, "must be a discrete-time system"),
     ({"feedback_path": [0.1, 0.2]}, ValueError, "feedback_path must have a delay .* first tap is 0.1, not 0"),
     ({"amplifier": 2.0}, TypeError, "amplifier must be a function of a sample, or None, got 2.0"),
-    ({"fs": 0.0}, ValueError, "fs must be greater than 0 Hz"),
-    ({"fs": np.nan}, ValueError, "fs must be finite"),
-    ({"rated_power": -1.0}, ValueError, "rated_power must be greater than 0"),
-    ({"sensor_noise_std": -0.1, "rng": 0}, ValueError, "sensor_noise_std must not be negative, got -0.1"),
     ({"sensor_noise_std": 0.1}, TypeError, "rng must be a seed or a numpy.random.Generator"),
-    ({"switch_on_s": -1.0}, ValueError, "switch_on_s must not be negative"),
     ({"switch_on_s": 300 / 16000}, ValueError, "switch_on_s must leave samples to control"),
-    ({"switch_on_s": 1.0}, ValueError, "switch_on_s must leave samples to control"),
-    ({"record_weights_every": 0}, ValueError, "record_weights_every must be at least 1"),
     ({"record_weights_every": 0.5}, TypeError, "record_weights_every must be a whole number"),
 ]
 
