@@ -108,15 +108,9 @@ def test_one_channel_as_a_matrix_is_the_bound_of_one_channel() -> None:
 )
 def test_what_does_not_fit_is_refused(changed: dict, match: str) -> None:
     x, d = signals()
-    arguments = {
-        "reference": x,
-        "disturbance": d,
-        "secondary_path": SECONDARY,
-        "n_taps": TAPS,
-        "rated_power": 1.0,
-    } | changed
+    given = {"reference": x, "disturbance": d, "secondary_path": SECONDARY, "rated_power": 1.0} | changed
     with pytest.raises(ValueError, match=match):
-        power_constrained_wiener(**arguments, fs=FS)
+        power_constrained_wiener(**given, n_taps=TAPS, fs=FS)
 
 
 @pytest.mark.parametrize("gain", [1e-3, 1e3])

@@ -69,39 +69,27 @@ X, D = recording(200, 4, 0.1, 0)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "kind", "message"),
+    ("arguments", "message"),
     [
-        ((X, D[:-1], S, 4), ValueError, "disturbance must have 200 values, got 199"),
-        ((X[:0], D[:0], S, 4), ValueError, "reference must have at least 1 value"),
-        ((np.where(X > 2, np.nan, X), D, S, 4), ValueError, "reference must be finite"),
-        ((X, np.where(D > 2, np.inf, D), S, 4), ValueError, "disturbance must be finite"),
-        ((X, D, [np.nan], 4), ValueError, "secondary_path must be finite"),
-        ((X, D, S, 0), ValueError, "n_taps must be at least 1"),
-        ((X, D, S, 2.5), TypeError, "n_taps must be a whole number"),
-        ((X[:13], D[:13], S, 4), ValueError, r"at least 14 samples for 4 taps and a\s+secondary path of 4, got 13"),
-        ((0 * X, D, S, 4), ValueError, "reference"),
-        ((X, D, 0 * S, 4), ValueError, "silent|zero|energy"),
+        ((X, D[:-1], S, 4), "disturbance must have 200 values, got 199"),
+        ((np.where(X > 2, np.nan, X), D, S, 4), "reference must be finite"),
+        ((X[:13], D[:13], S, 4), r"at least 14 samples for 4 taps and a\s+secondary path of 4, got 13"),
+        ((0 * X, D, S, 4), "reference"),
+        ((X, D, 0 * S, 4), "silent|zero|energy"),
     ],
 )
-def test_from_run_refuses(arguments, kind, message):
-    with pytest.raises(kind, match=message):
+def test_from_run_refuses(arguments, message):
+    with pytest.raises(ValueError, match=message):
         measurement_noise_from_run(*arguments)
 
 
-@pytest.mark.parametrize(
-    ("residual", "n_fitted", "kind", "message"),
-    [
-        ([], 0, ValueError, "residual must have at least 1 value"),
-        ([1.0, 2.0], 2, ValueError, "residual must have at least 3 value"),
-        ([1.0, np.nan], 0, ValueError, "residual must be finite"),
-        ([[1.0, 2.0]], 0, ValueError, "residual must be one-dimensional"),
-        ([1.0], -1, ValueError, "n_fitted must be at least 0"),
-        ([1.0], 0.5, TypeError, "n_fitted must be a whole number"),
-    ],
-)
-def test_from_residual_refuses(residual, n_fitted, kind, message):
-    with pytest.raises(kind, match=message):
-        measurement_noise_from_residual(residual, n_fitted=n_fitted)
+def test_from_residual_refuses():
+    with pytest.raises(ValueError, match="residual must have at least 3 value"):
+        measurement_noise_from_residual([1.0, 2.0], n_fitted=2)
+    with pytest.raises(ValueError, match="residual must be finite"):
+        measurement_noise_from_residual([1.0, np.nan])
+    with pytest.raises(ValueError, match="n_fitted must be at least 0"):
+        measurement_noise_from_residual([1.0], n_fitted=-1)
 
 
 def test_says_when_it_cannot_tell():

@@ -361,42 +361,34 @@ def test_results_outlive_the_arrays_they_came_from():
             array[0] = 1.0
 
 
-def test_system_and_taps_give_the_same_and_rates_must_agree():
+def test_system_and_taps_give_the_same():
     x, d, s = scene()
-    with_taps = power_constrained_wiener(x, d, s, 8, 0.1, fs=FS)
-    with_system = power_constrained_wiener(x, d, fir_path(s, FS), 8, 0.1, fs=FS)
-    np.testing.assert_allclose(with_system.whole.weights, with_taps.whole.weights, atol=1e-12)
-    with pytest.raises(ValueError, match="secondary_path is sampled at 400 Hz but fs is 200 Hz"):
-        power_constrained_wiener(x, d, fir_path(s, 400.0), 8, 0.1, fs=FS)
+    weights = [power_constrained_wiener(x, d, path, 8, 0.1, fs=FS).whole.weights for path in (s, fir_path(s, FS))]
+    np.testing.assert_allclose(*weights, atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"d": np.ones(999)}, "disturbance must have 1000 values, got 999"),
-        ({"x": np.full(1000, np.nan)}, "reference must be finite"),
-        ({"x": np.zeros(1000)}, "reference through secondary_path must not be silent"),
-        ({"d": np.zeros(1000)}, "disturbance must not be silent"),
-        ({"x": np.r_[np.ones(100), np.zeros(900)], "switch_on_s": 1.0}, "reference through secondary_path must not be"),
-        ({"n_taps": 0}, "n_taps must be at least 1, got 0"),
+        ({"reference": np.zeros(1000)}, "reference through secondary_path must not be silent"),
+        ({"disturbance": np.zeros(1000)}, "disturbance must not be silent"),
+        (
+            {"reference": np.r_[np.ones(100), np.zeros(900)], "switch_on_s": 1.0},
+            "through secondary_path must not be sil",
+        ),
         ({"rated_power": 0.0}, "rated_power must be greater than 0, got 0"),
-        ({"rated_power": np.inf}, "rated_power must be finite"),
-        ({"fs": 0}, "fs must be greater than 0 Hz"),
         ({"ridge": -1.0}, "ridge must not be negative"),
-        ({"switch_on_s": -1.0}, "switch_on_s must not be negative"),
         ({"switch_on_s": 4.97}, "at least 8 samples from switch_on_s on for 8 taps, got 6; use a longer signal"),
-        ({"switch_on_s": 9.0}, "at least 8 samples from switch_on_s on for 8 taps, got 0"),
         ({"segment_s": 0.075}, r"segment_s must be at least 0.08 s, twice the 8 taps, got 0.075 s: .* longer segments"),
-        ({"segment_s": 0.0}, "segment_s must be greater than 0 s"),
-        ({"s": np.zeros(3)}, "reference through secondary_path must not be silent|not all be zero"),
+        ({"secondary_path": np.zeros(3)}, "reference through secondary_path must not be silent|not all be zero"),
+        ({"secondary_path": fir_path([0.0, 1.0], 400.0)}, "secondary_path is sampled at 400 Hz but fs is 200 Hz"),
     ],
 )
 def test_bad_input_is_refused(change, message):
     x, d, s = scene()
-    arguments = {"x": x, "d": d, "s": s, "n_taps": 8, "rated_power": 0.1, "fs": FS} | change
-    positional = [arguments.pop(name) for name in ("x", "d", "s", "n_taps", "rated_power")]
+    arguments = {"reference": x, "disturbance": d, "secondary_path": s, "n_taps": 8, "rated_power": 0.1, "fs": FS}
     with pytest.raises(ValueError, match=message):
-        power_constrained_wiener(*positional, **arguments)
+        power_constrained_wiener(**arguments | change)
 
 
 @pytest.mark.parametrize(
@@ -404,8 +396,6 @@ def test_bad_input_is_refused(change, message):
     [
         (5.0, None, "start_s and end_s must mark a part of the 5 s that count, got 5 s to 5 s"),
         (2.0, 1.0, "got 2 s to 1 s"),
-        (0.0, 5.5, "got 0 s to 5.5 s"),
-        (-1.0, None, "start_s must not be negative"),
     ],
 )
 def test_parts_outside_the_record_are_refused(start_s, end_s, message):

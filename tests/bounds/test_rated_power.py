@@ -60,10 +60,7 @@ def test_limits_and_shapes():
     [
         ([5.0, 20.0], {}, r"must not exceed what the Wiener filter attains, 13.01 dB, got 20 dB"),
         (-1.0, {}, "noise_reduction_db must not be negative"),
-        (np.nan, {}, "noise_reduction_db must be finite"),
         (5.0, {"antinoise_power": 2.1}, "antinoise_power must not exceed disturbance_power"),
-        (5.0, {"control_power": 0.0}, "control_power must be greater than 0"),
-        (5.0, {"beyond": "nan"}, "beyond must be one of 'raise', 'inf'"),
     ],
 )
 def test_refuses(wanted, changes, message):
@@ -143,13 +140,10 @@ def test_the_limits_of_a_budget():
     ("changed", "message"),
     [
         ({"noise_reduction_db": 90.0}, "must not exceed what unlimited power attains, .* dB, got 90 dB; use longer"),
-        ({"noise_reduction_db": -1.0}, "noise_reduction_db must not be negative"),
         ({"proportions": [1.0, 2.0, 3.0]}, "proportions must be one number or one for each of the 2 loudspeakers"),
-        ({"proportions": [1.0, 0.0]}, "proportions must be greater than 0"),
         ({"beyond": "nan"}, "beyond must be one of"),
-        ({"disturbance": np.zeros((K, 2500))}, "disturbance must not be silent"),
     ],
-    ids=["far", "negative", "three", "zero", "beyond", "silent"],
+    ids=["far", "three", "beyond"],
 )
 def test_a_budget_that_cannot_be_is_refused(changed, message):
     x, d = signals()

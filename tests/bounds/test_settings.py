@@ -181,37 +181,23 @@ def test_the_noise_in_bursts_is_called_so():
 
 
 @pytest.mark.parametrize(
-    ("change", "kind", "message"),
+    ("change", "message"),
     [
-        ({"reference": X[:-1]}, ValueError, "disturbance must have 31999 values"),
-        ({"reference": np.zeros(X.size)}, ValueError, "must not be silent"),
-        ({"disturbance": np.zeros(X.size)}, ValueError, "disturbance must not be silent"),
-        ({"reference": 1e-160 * X}, ValueError, r"the filtered reference must have a mean square from 1e-60 to 1e\+60"),
-        (
-            {"disturbance": 1e100 * D},
-            ValueError,
-            r"disturbance must have a mean square from 1e-60 to 1e\+60, got .*: scale",
-        ),
-        ({"disturbance": np.where(X > 2, np.nan, D)}, ValueError, "disturbance must be finite"),
-        ({"secondary_path": np.zeros((2, 2, 4))}, ValueError, r"\(K microphones, n_samples\) = \(2, 32000\)"),
-        ({"secondary_path": bandpass_path(32, fs=12000.0)}, ValueError, "sampled at 12000 Hz but fs is 16000 Hz"),
-        ({"fs": 0.0}, ValueError, "fs must be greater than 0"),
-        ({"memory_s": -1.0}, ValueError, "memory_s must be greater than 0"),
-        ({"n_taps": 0}, ValueError, "n_taps must be at least 1"),
-        ({"n_taps": 2.5}, TypeError, "n_taps must be a whole number"),
-        ({"max_taps": 0}, ValueError, "max_taps must be at least 1"),
-        ({"n_taps": 2909}, ValueError, "at least 32001 samples for 2909 control and 4 path taps, got 32000; record"),
-        (
-            {"reference": X[:2000], "disturbance": D[:2000], "secondary_path": np.ones(1995)},
-            ValueError,
-            "record a longer silent run, or cut the impulse response",
-        ),
-        ({"reference": X[:12], "disturbance": D[:12]}, ValueError, "at least 13 samples for 1 control"),
+        ({"reference": np.zeros(X.size)}, "must not be silent"),
+        ({"disturbance": np.zeros(X.size)}, "disturbance must not be silent"),
+        ({"reference": 1e-160 * X}, r"the filtered reference must have a mean square from 1e-60 to 1e\+60"),
+        ({"disturbance": 1e100 * D}, r"disturbance must have a mean square from 1e-60 to 1e\+60, got .*: scale"),
+        ({"secondary_path": np.zeros((2, 2, 4))}, r"\(K microphones, n_samples\) = \(2, 32000\)"),
+        ({"secondary_path": bandpass_path(32, fs=12000.0)}, "sampled at 12000 Hz but fs is 16000 Hz"),
+        ({"n_taps": 2909}, "at least 32001 samples for 2909 control and 4 path taps, got 32000; record"),
+        ({"secondary_path": np.ones(31995)}, "record a longer silent run, or cut the impulse response"),
+        ({"reference": X[:12], "disturbance": D[:12]}, "at least 13 samples for 1 control"),
+        ({"memory_s": -1.0}, "memory_s must be greater than 0"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
-def test_it_refuses(change, kind, message):
-    with pytest.raises(kind, match=message):
+def test_it_refuses(change, message):
+    with pytest.raises(ValueError, match=message):
         suggest_settings(**{"reference": X, "disturbance": D, "secondary_path": S} | change)
 
 
@@ -281,12 +267,10 @@ def test_a_large_initial_variance_diverges_where_the_suggested_one_does_not():
 def test_a_controller_takes_suggested_settings_where_none_is_given(make: Any) -> None:
     rated = {} if make is kf_anc else {"rated_power": 0.5}
     suggested = suggest_settings(X, D, S, n_taps=8)
-    ours = make(suggested, S, **rated)
-    by_hand = make(8, S, **rated, **suggested.settings)
-    own = make(suggested, S, measurement_noise=0.25, **rated)
-    assert ours.n_taps == 8
-    for name in ("covariance", "state_noise", "measurement_noise"):
+    ours, by_hand = make(suggested, S, **rated), make(8, S, **rated, **suggested.settings)
+    for name in ("n_taps", "covariance", "state_noise", "measurement_noise"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(by_hand, name), err_msg=name)
+    own = make(suggested, S, measurement_noise=0.25, **rated)
     assert own.measurement_noise == 0.25
     np.testing.assert_array_equal(own.covariance, by_hand.covariance)
 

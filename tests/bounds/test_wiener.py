@@ -84,15 +84,10 @@ def test_coherence_bound_is_the_incoherent_share():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda x, d, s: wiener_solution(x, d[:-1], s, 4), "disturbance must have 3000 values, got 2999"),
         (lambda x, d, s: wiener_solution(x[:9], d[:9], s, 4), "reference must have at least 10 samples"),
         (lambda x, d, s: wiener_solution(0 * x, d, s, 4), "reference through secondary_path must not be silent"),
         (lambda x, d, s: wiener_solution(x, 0 * d, s, 4), "disturbance must not be silent"),
-        (lambda x, d, s: wiener_solution(x, d, s, 0), "n_taps must be at least 1"),
-        (lambda x, d, s: wiener_solution(x * np.nan, d, s, 4), "reference must be finite"),
         (lambda x, d, s: wiener_solution(x, d, s, 4, regularization=-1), "regularization must not be negative"),
-        (lambda x, d, s: wiener_solution(x, d, s, 4, control_penalty=-1), "control_penalty must not be neg"),
-        (lambda x, d, s: power_constrained_solution(x, d, s, 4, 0.0), "rated_power must be greater than 0"),
         (lambda x, d, s: coherence_bound(x, d, FS, segment=1024), "reference must have at least 8192"),
         (lambda x, d, s: coherence_bound(0 * x, d, FS, segment=64), "must not be silent"),
     ],
@@ -138,10 +133,12 @@ def test_the_bounds_within_a_power_warn_too():
     x, d, s = narrow()
     with pytest.warns(np.exceptions.RankWarning, match="no bound"):
         free = wiener_solution(x, d, s, 64).control_power
-    with pytest.warns(np.exceptions.RankWarning, match="no bound"):
-        power_constrained_solution(x, d, s, 64, 2 * free)
-    with pytest.warns(np.exceptions.RankWarning, match="no bound"):
-        power_constrained_wiener(x, d, s, 64, 2 * free, fs=FS, switch_on_s=0.1)  # without the start-up
+    for bound, options in (
+        (power_constrained_solution, {}),
+        (power_constrained_wiener, {"fs": FS, "switch_on_s": 0.1}),
+    ):
+        with pytest.warns(np.exceptions.RankWarning, match="no bound"):
+            bound(x, d, s, 64, 2 * free, **options)
 
 
 def test_what_the_cut_does_not_change_does_not_warn():

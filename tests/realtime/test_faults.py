@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
@@ -80,20 +79,6 @@ def test_an_offset_is_found_and_subtracted() -> None:
         silent = 1e-4 * noise()
         silent[0] += offset
         assert np.any(inspector()(silent)) == expected
-
-
-def test_nothing_depends_on_the_blocks() -> None:
-    heard = noise()
-    heard[0, 100:110] = np.nan
-    heard[0, 500:900] = 0.3
-    heard[0, 2000:] += 0.7
-    whole, parts = heard.copy(), heard.copy()
-    kinds = inspector()(whole)
-    by_parts = inspector()
-    cuts = [0, 1, 50, 105, 513, 514, 2001, 8000]
-    got = [by_parts(parts[:, a:b]) for a, b in itertools.pairwise(cuts)]
-    np.testing.assert_array_equal(np.concatenate(got, axis=1), kinds)
-    np.testing.assert_array_equal(parts, whole)
 
 
 def test_a_repeated_block() -> None:

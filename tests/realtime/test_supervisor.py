@@ -28,16 +28,10 @@ PRIMARY[[70, 75, 82]] = 1.0, 0.5, -0.3
 PATHS = np.concatenate((np.zeros((2, 2, LATENCY)), random_paths(2, 2, 5, seed=2)), axis=2)
 LIMIT = 4.0
 
+KALMAN = {"state_noise": 1e-7, "measurement_noise": 1e-2, "initial_variance": 1e-2}
 MAKERS: dict[str, Any] = {
     "FxLMS": lambda: FxLMS(24, PATH, step_size=1e-3),
-    "KF-OPC": lambda: kf_opc(
-        24,
-        PATH,
-        constraint=OutputPowerConstraint(0.5, fs=FS),
-        state_noise=1e-7,
-        measurement_noise=1e-2,
-        initial_variance=1e-2,
-    ),
+    "KF-OPC": lambda: kf_opc(24, PATH, constraint=OutputPowerConstraint(0.5, fs=FS), **KALMAN),
     "FxLMS of several channels": lambda: FxLMS(16, PATHS, step_size=3e-4),
     "hybrid FxLMS of several channels": lambda: with_internal_model(FxLMS(16, PATHS, step_size=3e-4, n_references=3)),
     "verified": lambda: VerifiedController(FxLMS(24, PATH, step_size=1e-3), fs=FS),
@@ -197,27 +191,26 @@ def test_nothing_is_learned_from_bad_samples(name: str, where: str) -> None:
 def test_missing_blocks_and_values_are_bad_samples(missing: str) -> None:
     supervisor = supervised(MAKERS["FxLMS"]())
     good = np.random.default_rng(0).standard_normal(32)
-    blocks = {"references": good, "errors": good} | {missing: None}
-    assert supervisor.process(**blocks).shape == (32,)
-    assert supervisor.health.samples["not finite"] == 32
-    with_none = [*good[:-1].tolist(), None]
-    supervisor.process(with_none, good)
+    blocks = {"references": good, "errors": good}
+    assert supervisor.process(**blocks | {missing: None}).shape == (32,)
+    supervisor.process(**blocks | {missing: [*good[:-1].tolist(), None]})
     assert supervisor.health.samples["not finite"] == 33
 
 
-def test_blocks_that_do_not_fit_are_refused_and_nothing_changes() -> None:
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((None, None), "references or errors must be given"),
+        ((np.ones(32), np.ones(5)), "the same number of samples"),
+        ((np.ones(32), np.ones((2, 32))), r"errors must be \(n_samples,\)"),
+        (([], []), "at least 1"),
+        (("noise", np.ones(32)), "references|float"),
+    ],
+)
+def test_blocks_that_do_not_fit_are_refused_and_nothing_changes(given: Any, message: str) -> None:
     supervisor = supervised(MAKERS["FxLMS"]())
-    good = np.ones(32)
-    with pytest.raises(ValueError, match="references or errors must be given"):
-        supervisor.process(None, None)
-    with pytest.raises(ValueError, match="the same number of samples"):
-        supervisor.process(good, good[:5])
-    with pytest.raises(ValueError, match=r"errors must be \(n_samples,\)"):
-        supervisor.process(good, np.ones((2, 32)))
-    with pytest.raises(ValueError, match="at least 1"):
-        supervisor.process([], [])
-    with pytest.raises((TypeError, ValueError), match=r"references|float"):
-        supervisor.process("noise", good)
+    with pytest.raises((TypeError, ValueError), match=message):
+        supervisor.process(*given)
     assert not supervisor.health.counts
 
 
@@ -313,7 +306,7 @@ def test_surprising_innovations_are_a_divergence() -> None:
     def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[Any, Any]:
         return x, (1e3 * e if first >= 20000 else e)
 
-    free = kf_anc(24, PATH, state_noise=1e-7, measurement_noise=1e-2, initial_variance=1e-2)  # no power can be exceeded
+    free = kf_anc(24, PATH, **KALMAN)  # no power can be exceeded
     supervisor = supervised(free, amplitude_limit=1e9, full_scale=None)
     loop(supervisor, plant(seconds=4.0), spoil)
     assert supervisor.health.counts["diverged: innovation"] >= 1
@@ -337,9 +330,8 @@ def test_long_faults_fade_out_and_in_again() -> None:
     y, _ = loop(supervisor, plant(seconds=4.0), spoil)
     counts = supervisor.health.counts
     assert counts["silent: no usable input"] == counts["running again"] == 1
+    assert y[0, 12000] != 0.0
     assert not np.any(y[0, 13000:19900])
-    assert np.any(y[0, 12000] != 0.0)
-    assert np.all(np.abs(y[0, 21000:]) <= LIMIT)
     assert np.std(y[0, 21000:]) > 0.1
 
 
@@ -395,52 +387,36 @@ def test_fades_are_smooth() -> None:
     assert supervisor.muted
 
 
-def test_settings_that_are_out_of_range_are_refused() -> None:
-    controller = MAKERS["FxLMS"]()
-    bad: list[tuple[dict[str, Any], str]] = [
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
         ({"amplitude_limit": 0.0}, "amplitude_limit must be greater than 0"),
         ({"on_divergence": "panic"}, "on_divergence must be"),
-        ({"fs": -1.0}, "fs must be greater than 0"),
-        ({"stuck_s": 0.0}, "stuck_s must be greater than 0"),
         ({"full_scale": -1.0}, "full_scale must be greater than 0"),
-    ]
-    for changed, message in bad:
-        with pytest.raises(ValueError, match=message):
-            supervised(controller, **changed)
-    with pytest.raises(TypeError, match="controller must have control_signal"):
-        supervised(object())
-    with pytest.raises(ValueError, match="fs is 8000 Hz but"):
-        supervised(kf_opc(8, PATH, rated_power=1.0, state_noise=1e-6, measurement_noise=1e-2))
+        ({"controller": object()}, "controller must have control_signal"),
+        (
+            {"controller": kf_opc(8, PATH, rated_power=1.0, state_noise=1e-6, measurement_noise=1e-2)},
+            "fs is 8000 Hz but",
+        ),
+    ],
+)
+def test_settings_that_are_out_of_range_are_refused(changed: dict[str, Any], message: str) -> None:
+    with pytest.raises((TypeError, ValueError), match=message):
+        supervised(**{"controller": MAKERS["FxLMS"]()} | changed)
 
 
 def test_its_results_depend_on_the_blocks_only_through_the_windows() -> None:
-    """Without a divergence, any cut of the signals gives the same control signals."""
-    x, e = np.random.default_rng(3).standard_normal((2, 2000))
-    x[500:520] = np.nan
-    e[900] = np.inf
-    whole, parts = supervised(MAKERS["FxLMS"]()), supervised(MAKERS["FxLMS"]())
+    """Without a divergence, any cut of the signals gives the same control signals and finds the same faults."""
+    x, e = 0.2 * np.random.default_rng(3).standard_normal((2, 8000))
+    x[100:110], e[300] = np.nan, np.inf
+    e[500:1500], x[3000:] = 0.3, x[3000:] + 0.7
+    whole, parts = (supervised(MAKERS["FxLMS"](), full_scale=1.0) for _ in range(2))
     expected = whole.process(x, e)
-    cuts = [0, 1, 40, 510, 515, 600, 901, 1500, 2000]
+    cuts = [0, 1, 50, 105, 513, 514, 1501, 3001, 8000]
     got = [parts.process(x[a:b], e[a:b]) for a, b in itertools.pairwise(cuts)]
     np.testing.assert_array_equal(np.concatenate(got), expected)
-
-
-def test_a_user_who_fades_out_is_not_overruled() -> None:
-    supervisor = diverging(pause_s=0.2)
-    interface = plant(seconds=4.0)
-    loop_until_muted = 0
-    while not supervisor.health.counts["muted"] and loop_until_muted < 1000:
-        block = interface.read()
-        assert block is not None
-        interface.write(np.atleast_2d(supervisor.process(block.references[0], block.errors[0])))
-        loop_until_muted += 1
-    supervisor.fade_out()
-    rest, _ = loop(supervisor, interface)
-    assert supervisor.muted
-    assert not np.any(rest[0, 800:])
-    supervisor.fade_in()
-    y, _ = loop(supervisor, plant(seconds=0.5))
-    assert np.any(y)
+    assert parts.health.samples == whole.health.samples
+    assert set(whole.health.samples) == {"not finite", "stuck", "offset", "clipped"}
 
 
 @pytest.mark.parametrize("user", ["leaves it alone", "fades out in the pause"])
@@ -509,13 +485,12 @@ def test_silence_with_bad_samples_keeps_the_delay_lines_in_time() -> None:
 @pytest.mark.parametrize(
     ("lost", "error", "message"),
     [
-        (..., TypeError, "lost must be a whole number"),
+        (1.5, TypeError, "lost must be a whole number"),
         (-1, ValueError, "lost must be at least 0"),
-        (1.5, TypeError, "lost"),
         (10**400, ValueError, "lost must be finite"),
         (2**53 + 1, ValueError, "lost must be at most 9007199254740992 samples"),
     ],
-    ids=["ellipsis", "negative", "fraction", "beyond a float", "beyond a clock"],
+    ids=["fraction", "negative", "beyond a float", "beyond a clock"],
 )
 def test_a_wrong_number_of_lost_samples_changes_nothing(lost: Any, error: type[Exception], message: str) -> None:
     supervisor, block = supervised(MAKERS["FxLMS"]()), np.full(8, np.nan)
