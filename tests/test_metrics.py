@@ -45,11 +45,6 @@ def test_nse_is_the_direct_sum_over_the_window_that_ends_with_the_sample(window)
     np.testing.assert_allclose(nse_db(e, d, FS, window / FS), expected, rtol=0, atol=1e-11)
 
 
-def test_nse_default_window_is_5_ms():
-    e, d = noise(400, 1), noise(400, 2)
-    np.testing.assert_array_equal(nse_db(e, d, FS), nse_db(e, d, FS, 80 / FS))
-
-
 def test_nse_keeps_a_small_residual_after_a_huge_transient():
     # Differences of running sums would leave rounding of 1e16 * 1e-16 = 1 here, over a residual of 1e-12.
     e = np.concatenate([np.full(500, 1e8), np.full(500, 1e-6)])
@@ -85,11 +80,6 @@ def test_output_power_is_the_mean_square_of_the_steady_portion():
     assert output_power(y, steady=0.25) == pytest.approx(math.fsum(y[750:] ** 2) / 250, rel=1e-13)
     runs = np.array([y, 2 * y])
     assert output_power(runs, runs=True) == pytest.approx(2.5 * output_power(y), rel=1e-13)
-
-
-def test_a_single_sample_is_its_own_steady_portion():
-    assert output_power([3.0]) == 9.0
-    assert peak_control_signal([1.0, -2.0], steady=1e-9) == 2.0
 
 
 def test_overshoot_is_the_highest_full_window():
@@ -270,8 +260,8 @@ OF_A_PAIR = {
 }
 
 
-def coherence_of(d, a, **runs):
-    return coherence_and_gain(d, a, FS, (200.0, 2000.0), segment_s=0.01, **runs)
+def coherence_of(d, a, band=(200.0, 2000.0), **runs):
+    return coherence_and_gain(d, a, FS, band, segment_s=0.01, **runs)
 
 
 @pytest.mark.parametrize("name", OF_A_SIGNAL)
@@ -324,12 +314,6 @@ def test_loudspeakers_may_have_limits_of_their_own():
     rated, limits = [0.5, 1.0, 2.0], [1.0, 2.0, 3.0]
     np.testing.assert_array_equal(overshoot(y, rated, FS), [overshoot(y[k], rated[k], FS) for k in range(K)])
     np.testing.assert_array_equal(clipped_fraction(y, limits), [clipped_fraction(y[k], limits[k]) for k in range(K)])
-    with pytest.raises(ValueError, match="rated_power must have 3 values, got 2"):
-        overshoot(y, [1.0, 2.0], FS)
-    with pytest.raises(ValueError, match="limit must be a single number"):
-        clipped_fraction(y[0], [1.0, 2.0])
-    with pytest.raises(ValueError, match="limit must be greater than 0"):
-        clipped_fraction(y, [1.0, -1.0, 1.0])
 
 
 @pytest.mark.parametrize(
@@ -386,29 +370,24 @@ def test_silent_disturbance_gives_nan_without_a_warning():
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: nse_db([], [], FS), ValueError, r"error must have at least one sample"),
-        (lambda: nse_db([1.0], [1.0, 2.0], FS), ValueError, r"error and disturbance must have one shape"),
-        (lambda: nse_db([1.0], [1.0], FS, 1e-6), ValueError, r"window_s must be at least one sample"),
-        (lambda: nse_db([1.0], [1.0], 0.0), ValueError, r"fs must be greater than 0"),
-        (lambda: nse_db([np.inf], [1.0], FS), ValueError, r"error must hold finite numbers"),
-        (lambda: nse_db(["a"], [1.0], FS), TypeError, r"error must be a sequence of real numbers, got list"),
-        (lambda: nse_db([1j], [1.0], FS), TypeError, r"error must be a sequence of real numbers, got complex"),
-        (lambda: nse_db(np.ones((1, 1, 1)), [1.0], FS), ValueError, r"error must be \(n_samples,\) or"),
-        (lambda: noise_reduction_db([1.0], [1.0], steady=0.0), ValueError, r"steady must be a portion above 0"),
-        (lambda: noise_reduction_db([1.0], [1.0], steady=1.5), ValueError, r"steady must be a portion above 0"),
-        (lambda: output_power([]), ValueError, r"control_signal must have at least one sample"),
-        (lambda: overshoot([1.0], 0.0, FS), ValueError, r"rated_power must be greater than 0"),
-        (lambda: clipped_fraction([1.0], -1.0), ValueError, r"limit must be greater than 0"),
-        (lambda: harmonics_db(np.ones(80), np.ones(80), 400.0, FS), ValueError, r"at least 16 periods"),
-        (lambda: harmonics_db(np.ones(999), np.ones(999), 5e3, FS), ValueError, r"second harmonic below fs/2"),
-        (lambda: convergence_time_s([1.0], [1.0], FS, tolerance_db=0), ValueError, r"tolerance_db must be greater"),
-        (lambda: coherence_and_gain(np.ones(999), np.ones(999), FS, (200, 2000)), ValueError, r"at least 8 segments"),
-        (
-            lambda: coherence_and_gain(np.ones(FS), np.ones(FS), FS, (201, 202), segment_s=0.01),
-            ValueError,
-            r"holds no frequency bin",
-        ),
-        (lambda: power_spectrum_db([1.0], FS, scaling="power"), ValueError, r"scaling must be one of"),
+        (lambda: nse_db([], [], FS), ValueError, "error must have at least one sample"),
+        (lambda: nse_db([1.0], [1.0, 2.0], FS), ValueError, "error and disturbance must have one shape"),
+        (lambda: nse_db([1.0], [1.0], FS, 1e-6), ValueError, "window_s must be at least one sample"),
+        (lambda: nse_db([np.inf], [1.0], FS), ValueError, "error must hold finite numbers"),
+        (lambda: nse_db(["a"], [1.0], FS), TypeError, "error must be a sequence of real numbers, got list"),
+        (lambda: noise_reduction_db([1.0], [1.0], steady=0.0), ValueError, "steady must be a portion above 0"),
+        (lambda: noise_reduction_db([1.0], [1.0], steady=1.5), ValueError, "steady must be a portion above 0"),
+        (lambda: overshoot([1.0], 0.0, FS), ValueError, "rated_power must be greater than 0"),
+        (lambda: overshoot(np.ones((3, 9)), [1.0, 2.0], FS), ValueError, "rated_power must have 3 values, got 2"),
+        (lambda: clipped_fraction([1.0], [1.0, 2.0]), ValueError, "limit must be a single number"),
+        (lambda: clipped_fraction(np.ones((2, 9)), [1.0, -1.0]), ValueError, "limit must be greater than 0"),
+        (lambda: harmonics_db(np.ones(80), np.ones(80), 400.0, FS), ValueError, "at least 16 periods"),
+        (lambda: harmonics_db(np.ones(999), np.ones(999), 5e3, FS), ValueError, "second harmonic below fs/2"),
+        (lambda: coherence_of(np.ones(999), np.ones(999)), ValueError, "at least 8 segments"),
+        (lambda: coherence_of(np.ones(FS), np.ones(FS), (201, 202)), ValueError, "holds no frequency bin"),
+        (lambda: power_spectrum_db([1.0], FS, scaling="power"), ValueError, "scaling must be one of"),
+        (lambda: metrics.a_weighting_db([-1.0]), ValueError, "frequencies_hz must not be negative"),
+        (lambda: metrics.third_octave_levels_db(np.ones(4), FS), ValueError, "must be longer for a third-octave band"),
     ],
 )
 def test_refusals_say_what_was_wrong(call, error, message):
@@ -418,27 +397,14 @@ def test_refusals_say_what_was_wrong(call, error, message):
 
 # Levels.
 
-# Table of IEC 61672-1: nominal frequency, weighting A in dB, rounded to a tenth.
-A_WEIGHTING = {
-    31.5: -39.4,
-    63: -26.2,
-    125: -16.1,
-    250: -8.6,
-    500: -3.2,
-    1000: 0.0,
-    2000: 1.2,
-    4000: 1.0,
-    8000: -1.1,
-    16000: -6.6,
-}
+# Table of IEC 61672-1: weighting A in dB, rounded to a tenth, at 31.5, 63, 125, ... 16000 Hz.
+A_WEIGHTING = [-39.4, -26.2, -16.1, -8.6, -3.2, 0.0, 1.2, 1.0, -1.1, -6.6]
 
 
 def test_the_weighting_a_is_that_of_the_standards_table():
     exact = 1000 * 10.0 ** (0.3 * np.arange(-5, 5))  # what the nominal frequencies stand for
-    np.testing.assert_allclose(metrics.a_weighting_db(exact), list(A_WEIGHTING.values()), atol=0.1)
+    np.testing.assert_allclose(metrics.a_weighting_db(exact), A_WEIGHTING, atol=0.1)
     assert metrics.a_weighting_db(0.0) == -np.inf
-    with pytest.raises(ValueError, match="frequencies_hz must not be negative"):
-        metrics.a_weighting_db([-1.0])
 
 
 @pytest.mark.parametrize("hz", [100.0, 1000.0, 4000.0])
@@ -462,8 +428,6 @@ def test_the_bands_of_noise_add_up_and_channels_stay_apart():
     # White noise: a band's power is its width over fs/2; ten seconds leave a third of a decibel in the lowest ones.
     width = centres * (10**0.05 - 10**-0.05)
     np.testing.assert_allclose(levels[0][centres > 100], 10 * np.log10(width / (fs / 2))[centres > 100], atol=1.0)
-    with pytest.raises(ValueError, match="must be longer for a third-octave band"):
-        metrics.third_octave_levels_db(np.ones(4), fs)
 
 
 # IEC 61260-1, table 1, class 1: frequencies of octave bands over their centre, as exponents of 10**0.3, with the least
