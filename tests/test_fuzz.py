@@ -56,16 +56,8 @@ SCALARS: list[Any] = [
         ["x"],
         range(3),
     ),
-    *(
-        Fraction(1, 3),
-        np.float32(2.5),
-        np.float16(6e4),
-        np.longdouble(1.5),
-        np.int8(-3),
-        np.uint64(2**63),
-        np.bool_(True),
-    ),
-    *(np.datetime64("2020-01-01"), np.timedelta64(3, "s"), np.str_("a"), np.void(b"abc"), slice(3), Ellipsis),
+    *(Fraction(1, 3), np.float32(2.5), np.float16(6e4), np.longdouble(1.5), np.int8(-3), np.uint64(2**63), slice(3)),
+    *(np.bool_(True), np.datetime64("2020-01-01"), np.timedelta64(3, "s"), np.str_("a"), np.void(b"abc"), Ellipsis),
 ]
 DTYPES = ["f8", "f8", "f8", "f4", "f2", "i8", "u1", "bool", "c16", "O", ">f8", "U3", "M8[s]", "longdouble"]
 
@@ -180,15 +172,8 @@ def test_a_controller_refuses_and_goes_on_or_gives_finite_numbers(name: str) -> 
 def test_a_supervisor_is_finite_and_within_its_limit(name: str) -> None:
     for rng in rounds(12):
         action = rng.choice(["mute", "reset", "freeze"])
-        supervisor = Supervisor(
-            CONTROLLERS[name](),
-            fs=FS,
-            amplitude_limit=LIMIT,
-            on_divergence=str(action),
-            window_s=0.002,
-            fade_s=0.001,
-            pause_s=0.002,
-        )
+        times = {"window_s": 0.002, "fade_s": 0.001, "pause_s": 0.002}
+        supervisor = Supervisor(CONTROLLERS[name](), fs=FS, amplitude_limit=LIMIT, on_divergence=str(action), **times)
         several = supervisor.multichannel
         for _ in range(40):
             n = int(rng.integers(1, 17))

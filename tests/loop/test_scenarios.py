@@ -77,30 +77,30 @@ def assert_untouched(made, fresh):
         assert_goes_on_as(one, other)
 
 
-def require_as_alone(count, n, n_taps=7, window="exponential", **options):
-    made, alone = (filters(count, n_taps, window=window) for _ in range(2))
-    x, own = differing(count, n)
-    results = run_scenarios(made, x, fs=FS, record_powers=True, **own, **options)
-    assert_as_alone(results, one_by_one(alone, x, own, record_powers=True, **options), made, alone)
-    return results
-
-
 # ---- As run one by one
 
 
-@pytest.mark.parametrize(("count", "n_taps"), [(1, 7), (3, 1), (9, 40), (35, 7)])  # groups of 32 inside
-def test_scenarios_are_their_runs_one_by_one(count, n_taps):
-    results = require_as_alone(count, 777, n_taps)
-    assert min(r.constraint_factor.min() for r in results) < 0.9  # it did act, and so did the amplifiers
-    saturated = {i % 4 for i, r in enumerate(results) if np.any(r.amplifier_output != r.control_signal)}
-    assert saturated == {2, 3} & set(range(count))
+@pytest.mark.parametrize(
+    ("count", "n", "of_filters", "of_run"),
+    [
+        *(
+            (count, 777, {"n_taps": taps}, {}) for count, taps in ((1, 7), (3, 1), (9, 40), (35, 7))
+        ),  # groups of 32 inside
+        *((3, n, {}, {"rated_power": 2.0}) for n in (1, 64, 129, STRETCH, 3 * STRETCH + 1)),
+        *((count, 400, {}, {"switch_on_s": 123 / FS}) for count in (2, 9)),  # each has heard its own disturbance before
+        (9, 400, {"window": "sliding"}, {"switch_on_s": 30 / FS}),
+    ],
+)
+def test_scenarios_are_their_runs_one_by_one(count, n, of_filters, of_run):
+    made, alone = (filters(count, **of_filters) for _ in range(2))
+    x, own = differing(count, n)
+    results = run_scenarios(made, x, fs=FS, record_powers=True, **own, **of_run)
+    assert_as_alone(results, one_by_one(alone, x, own, record_powers=True, **of_run), made, alone)
     assert len({r.error.tobytes() for r in results}) == count
-    assert {r.algorithm for r in results} == ({"KF-OPC", "KF-ANC"} if count > 2 else {"KF-OPC"})
-
-
-@pytest.mark.parametrize("n", [1, 64, 129, STRETCH, 3 * STRETCH + 1])
-def test_any_length_of_a_run(n):
-    assert [r.error.shape for r in require_as_alone(3, n)] == [(n,)] * 3
+    if n > 300:
+        assert min(r.constraint_factor.min() for r in results) < 0.9  # it did act, and so did the amplifiers
+        saturated = {i % 4 for i, r in enumerate(results) if np.any(r.amplifier_output != r.control_signal)}
+        assert saturated == {2, 3} & set(range(count))
 
 
 def test_progress_comes_after_each_block():
@@ -108,15 +108,6 @@ def test_progress_comes_after_each_block():
     counts = []
     run_scenarios(filters(9), x, fs=FS, progress=counts.append, **own)
     assert counts == [9 * STRETCH, 9 * 7]
-
-
-def test_options_of_the_run():
-    late = require_as_alone(9, 400, switch_on_s=123 / FS)
-    np.testing.assert_array_equal(late[0].reference, differing(9, 400)[0][123:])
-    require_as_alone(2, 200, switch_on_s=60 / FS)  # each of the two has heard its own disturbance before
-    for result in require_as_alone(9, 400, window="sliding", switch_on_s=30 / FS):
-        assert 0.0 < result.constraint_factor.min() < 1.0
-    assert {r.rated_power for r in require_as_alone(3, 100, rated_power=2.0)} == {2.0}
 
 
 def limited(rated_power):

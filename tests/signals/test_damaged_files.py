@@ -290,12 +290,8 @@ def test_a_sampling_rate_that_is_none_is_refused(tmp_path):
     WRITERS["x.sofa"](tmp_path / "x.sofa")
     with h5py.File(tmp_path / "x.sofa", "r+") as file:
         file["Data.SamplingRate"][...] = 1e-310
-    with pytest.raises(ValueError, match=r"rate that .*x\.sofa states must be a sampling rate from 0\.001"):
+    with pytest.raises(ValueError, match=r"rate that .*x\.sofa states must be a sampling rate from"):
         read_path(tmp_path / "x.sofa", fs=FS)
-    WRITERS["x.npy"](tmp_path / "x.npy")
-    for rates in ({"fs": 1e308}, {"fs": FS, "file_fs": 1e308}):
-        with pytest.raises(ValueError, match="must be a sampling rate"):
-            read_recording(tmp_path / "x.npy", **rates)
 
 
 def test_resampling_to_any_rate_takes_no_more_than_the_room(tmp_path):

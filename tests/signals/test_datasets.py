@@ -1,4 +1,4 @@
-"""The measured duct, and fetching of measured data from a server on this machine; no test reaches beyond it."""
+"""Measured duct and room, and fetching of measured data from a server on this machine; no test reaches beyond it."""
 
 import hashlib
 import socket
@@ -12,11 +12,13 @@ from helpers.network import publish, serving
 from kfopc_filterpy.signals import (
     DataUnavailableError,
     MeasuredDuct,
+    MeasuredRoom,
     dataset_folder,
     fetch_dataset,
     has_dataset,
     list_datasets,
     load_measured_duct,
+    load_measured_room,
 )
 
 FILES = {
@@ -25,14 +27,18 @@ FILES = {
     "motor/Motor.mat": "Motor_noise",
     "compressor/compressor_16kHz.mat": "yr",
 }
+EACH = range(1, 5)
+ROOM = [f"P{k}" for k in EACH] + [f"S{k}{j}" for k in EACH for j in EACH]  # of microphone k and loudspeaker j
 
 
 @pytest.fixture
 def own_files(tmp_path, monkeypatch):
-    """A folder of small files in the published layout, which counts as the published one."""
-    for name, variable in FILES.items():
+    """A folder of small files in the published layout, which counts as the published one: S{k}{j} holds k and j."""
+    contents = {name: (variable, [1.0, 2.0, 3.0]) for name, variable in FILES.items()}
+    contents |= {f"room4x4/{name}.mat": (name, [float(digit) for digit in name[1:]]) for name in ROOM}
+    for name, (variable, values) in contents.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
-        scipy.io.savemat(tmp_path / name, {variable: np.arange(1.0, 4.0)[:, None]})
+        scipy.io.savemat(tmp_path / name, {variable: np.array(values)[:, None]})
     publish(tmp_path, monkeypatch)
     return tmp_path
 
@@ -63,7 +69,28 @@ def test_published_compressor_has_its_known_contents(shared_data):
     expected = scipy.io.loadmat(shared_data / "compressor" / "compressor_16kHz.mat")
     np.testing.assert_array_equal(duct.noise, expected["yr"][:, 0])
     np.testing.assert_allclose(np.diff(expected["tr"][:, 0]), 1 / duct.fs, rtol=1e-6)
-    np.testing.assert_array_equal(duct.secondary, load_measured_duct(shared_data).secondary)
+
+
+def test_published_room_has_its_known_contents(shared_data):
+    if not (shared_data / "room4x4").is_dir():
+        pytest.skip(f"no measured room: {shared_data} has no folder room4x4")
+    room = load_measured_room(shared_data)
+    assert (room.primary.shape, room.secondary.shape, room.fs) == ((4, 1, 256), (4, 4, 256), 16000)
+    for name, path in (("S23", room.secondary[1, 2]), ("P4", room.primary[3, 0])):
+        np.testing.assert_array_equal(path, scipy.io.loadmat(shared_data / "room4x4" / f"{name}.mat")[name][:, 0])
+    # The noise arrives 30 samples in, after every loudspeaker's sound: control is causal.
+    share = np.cumsum(room.secondary**2, axis=2) / np.sum(room.secondary**2, axis=2)[..., None]
+    onset = np.argmax(share > 0.01, axis=2)
+    assert 8 <= onset.min() < onset.max() <= 14
+
+
+def test_first_index_of_the_room_is_the_microphone_and_second_the_loudspeaker(own_files):
+    room = load_measured_room(own_files)
+    assert room.primary.tolist() == [[[k]] for k in EACH]
+    assert room.secondary.tolist() == [[[k, j] for j in EACH] for k in EACH]
+    (own_files / "room4x4" / "S41.mat").unlink()
+    with pytest.raises(DataUnavailableError, match=r"S41\.mat is missing: put https://.*/S41\.mat there"):
+        load_measured_room(own_files)
 
 
 @pytest.mark.parametrize(
@@ -79,47 +106,42 @@ def test_only_the_noise_that_is_asked_for_is_needed(own_files, noise, other):
         load_measured_duct(own_files, noise="fan")
 
 
-def test_folder_argument_comes_before_the_environment(own_files, data_folder, tmp_path):
+@pytest.mark.parametrize("load", [load_measured_duct, load_measured_room])
+def test_folder_argument_comes_before_the_environment(load, own_files, data_folder, tmp_path):
     data_folder(tmp_path / "elsewhere")
-    assert load_measured_duct(own_files).primary.tolist() == [1.0, 2.0, 3.0]
-    with pytest.raises(DataUnavailableError, match=r"elsewhere.duct.Pz1\.mat is missing: put https"):
-        load_measured_duct()
+    expected = load(own_files).primary
+    with pytest.raises(DataUnavailableError, match=r"elsewhere.*\.mat is missing: put https"):
+        load()
     data_folder(own_files)
-    assert load_measured_duct().noise.tolist() == [1.0, 2.0, 3.0]
+    np.testing.assert_array_equal(load().primary, expected)
+
+
+@pytest.mark.parametrize("load", [load_measured_duct, load_measured_room])
+def test_an_empty_environment_variable_names_no_folder(load, source, data_folder, tmp_path):
+    data_folder("")
+    with pytest.raises(DataUnavailableError, match=r"\.mat is missing: put .* or name another folder .*; without a folder, allow_download=True"):
+        load()
+    assert source.asked == []
+    assert dataset_folder() == tmp_path / "cache" / "kfopc_filterpy"
 
 
 def test_without_folder_or_permission_the_error_names_every_way(data_folder, uninstall):
     data_folder(None)
     uninstall("pooch")
-    with pytest.raises(DataUnavailableError, match=r"pooch is not installed.*or set KFOPC_DATA to a folder"):
+    with pytest.raises(DataUnavailableError, match=r"pooch is not installed.*or set KFOPC_DATA to a folder") as told:
         load_measured_duct()
-    with pytest.raises(FileNotFoundError):
-        load_measured_duct()
-
-
-def test_empty_environment_variable_names_no_folder(source, data_folder, tmp_path):
-    data_folder("")
-    with pytest.raises(
-        DataUnavailableError,
-        match=r"Pz1\.mat is missing: put .* or name another folder .*; without a folder, allow_download=True",
-    ):
-        load_measured_duct()
-    assert source.asked == []
-    assert dataset_folder() == tmp_path / "cache" / "kfopc_filterpy"
+    assert isinstance(told.value, FileNotFoundError)
 
 
 def test_download_asks_once_for_each_pinned_file_and_keeps_it(source):
-    duct = "/Luo-Zhengding/GFANC-Kalman/06badd525411571402e83212e7f00b2345cde62d/Pz%20and%20Sz/Duct_Path"
-    motor = "/Ji-Junwei/PriPathEst_MOVFxLMS_ANC/84bcdae3aaba5c7410898dcb20ba14f5d417c0d8/MOVFxLMS_PriEst"
-    compressor = "/ANC-Research/IC-DMCANC-CPA/ed1d5dbe59c990c1718052e6d3e28513ff12b70c/compressor_16kHz.mat"
-    assert load_measured_duct(allow_download=True, timeout_s=2.5).secondary.tolist() == [1.0, 2.0, 3.0]
-    assert source.asked == [f"{duct}/Pz1.mat", f"{duct}/Sz.mat", f"{motor}/Noise_data/Motor.mat"]
-    assert (dataset_folder() / "motor" / "Motor.mat").is_file()
-    assert load_measured_duct(allow_download=True).primary.tolist() == [1.0, 2.0, 3.0]
+    pinned = {dataset.name: ["/" + file.url.split("/", 3)[3] for file in dataset.files] for dataset in list_datasets()}
+    for _ in range(2):
+        assert load_measured_duct(allow_download=True, timeout_s=2.5).secondary.tolist() == [1.0, 2.0, 3.0]
+    assert source.asked == pinned["duct"] + pinned["motor"]
     assert load_measured_duct().primary.tolist() == [1.0, 2.0, 3.0]  # what is in the cache needs no permission
-    assert len(source.asked) == 3
     load_measured_duct(noise="compressor", allow_download=True)
-    assert source.asked[3:] == [compressor]
+    assert load_measured_room(allow_download=True).secondary[3, 1].tolist() == [4, 2]
+    assert source.asked == pinned["duct"] + pinned["motor"] + pinned["compressor"] + pinned["room"]
 
 
 def test_a_folder_comes_before_a_download(source, own_files, data_folder):
@@ -222,27 +244,36 @@ def test_every_dataset_states_where_it_comes_from():
         assert len(dataset.commit) == 40
         for file in dataset.files:
             assert file.url.startswith(f"https://raw.githubusercontent.com/{dataset.repository}/{dataset.commit}/")
-            assert len(file.sha256) == 64
-    names = [file.name for dataset in list_datasets() for file in dataset.files]
-    assert len(names) == len(set(names))
+    files = {file.name: file.variable for dataset in list_datasets() for file in dataset.files}
+    assert files == FILES | {f"room4x4/{name}.mat": name for name in ROOM}
 
 
 def test_pinned_hashes_are_those_of_the_published_files(shared_data):
-    files = {file.name: file for dataset in list_datasets() for file in dataset.files}
-    assert {name: files[name].variable for name in FILES} == FILES
-    there = [file for name, file in files.items() if (shared_data / name).is_file()]
-    assert len(there) >= len(FILES)
-    for file in there:
+    files = [file for dataset in list_datasets() for file in dataset.files if (shared_data / file.name).is_file()]
+    assert len(files) >= len(FILES)
+    for file in files:
         assert hashlib.sha256((shared_data / file.name).read_bytes()).hexdigest() == file.sha256
 
 
-def test_measured_duct_of_own_signals_is_checked():
-    duct = MeasuredDuct([0, 1], [1], [1, 2, 3], fs=8000)
-    assert duct.primary.dtype == np.float64
+SQUARE = np.ones((2, 2, 3), dtype=int)
+
+
+@pytest.mark.parametrize(
+    ("kind", "signals", "message"),
+    [
+        (MeasuredDuct, ([1], [[1]], [1]), "secondary must be one-dimensional"),
+        (MeasuredDuct, ([1], [1], [np.nan]), "noise must be finite"),
+        (MeasuredRoom, (SQUARE, SQUARE[0]), r"secondary must have shape \(K microphones, inputs, taps\), got \(2, 3\)"),
+        (MeasuredRoom, (SQUARE[:1], SQUARE), "must have the same K microphones as their first axis, got 1 and 2"),
+        (MeasuredRoom, (np.nan * SQUARE, SQUARE), "primary must be finite"),
+    ],
+)
+def test_measured_data_of_ones_own_are_checked(kind, signals, message):
+    good = MeasuredDuct([0, 1], [1], [1, 2, 3]) if kind is MeasuredDuct else MeasuredRoom(SQUARE, SQUARE)
+    assert good.primary.dtype == np.float64
     with pytest.raises(AttributeError):
-        duct.fs = 1
-    for signals, message in ((([1], [[1]], [1]), "secondary must be one-"), (([1], [1], [np.nan]), "noise must be")):
-        with pytest.raises(ValueError, match=message):
-            MeasuredDuct(*signals)
+        good.fs = 1
+    with pytest.raises(ValueError, match=message):
+        kind(*signals)
     with pytest.raises(ValueError, match="fs must be greater than 0"):
-        MeasuredDuct([1], [1], [1], fs=0)
+        kind(*[good.primary, good.secondary, [1]][: len(signals)], fs=0)

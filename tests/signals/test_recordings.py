@@ -73,25 +73,20 @@ def test_wav_by_another_writer_is_read(tmp_path, width, stored):
 
 
 @pytest.mark.parametrize(("shape", "kind"), [((5, 1), np.float64), ((1, 5), np.float32), ((5,), np.int16)])
-@pytest.mark.parametrize("suffix", ["mat", "npy", "npz"])
-def test_vectors_of_any_shape_and_type_are_read(tmp_path, shape, kind, suffix):
-    values, path = np.arange(5).astype(kind).reshape(shape), tmp_path / f"x.{suffix}"
-    if suffix == "mat":
-        scipy.io.savemat(path, {"x": values}, oned_as="column")
-    else:
-        (np.savez if suffix == "npz" else np.save)(path, values)
-    read = read_recording(path, fs=FS)
-    assert read.samples.dtype == np.float64
-    assert read.samples.tolist() == [0, 1, 2, 3, 4]
+@pytest.mark.parametrize("write", [np.save, np.savez, lambda path, x: scipy.io.savemat(path, {"x": x})])
+def test_vectors_of_any_shape_and_type_are_read(tmp_path, shape, kind, write):
+    write(tmp_path / "x", np.arange(5).astype(kind).reshape(shape))
+    (path,) = tmp_path.iterdir()
+    read = read_recording(path, fs=FS).samples
+    assert (read.dtype, read.tolist()) == (np.float64, [0, 1, 2, 3, 4])
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_the_longer_axis_of_an_array_is_time(tmp_path, order):
-    table = np.array(signal(3, 10).T, order=order)
-    np.save(tmp_path / "x.npy", table)
-    np.testing.assert_array_equal(read_recording(tmp_path / "x.npy", fs=FS).samples, table.T)
-    np.save(tmp_path / "x.npy", table.T)
-    np.testing.assert_array_equal(read_recording(tmp_path / "x.npy", fs=FS).samples, table.T)
+    table = np.array(signal(3, 10), order=order)
+    for stored in (table, table.T):
+        np.save(tmp_path / "x.npy", stored)
+        np.testing.assert_array_equal(read_recording(tmp_path / "x.npy", fs=FS).samples, table)
 
 
 def test_a_variable_of_several_is_chosen_by_name(tmp_path):
@@ -162,7 +157,7 @@ def test_rates_that_contradict_or_have_no_ratio_are_refused(tmp_path):
     for rates, message in (
         ({"file_fs": 8000}, r"x\.wav states a sampling rate of 16000 Hz, but file_fs = 8000 Hz: leave it out"),
         ({"fs": 16000 * np.pi}, "sample rates must be in a ratio of whole numbers"),
-        ({"fs": 0}, "fs must be greater than 0"),
+        ({"fs": 1e308}, "fs must be a sampling rate from"),
         ({"fs": FS * 50_000}, r"resampled from 16000 to 8e\+08 Hz it has 1e\+07 samples"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -292,32 +287,6 @@ def test_a_truncated_file_is_refused(name, tmp_path):
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(ValueError, match=f"{name} (is cut short|is damaged|cannot be read as a|has no whole data set)"):
         read_recording(path, fs=FS)
-
-
-@pytest.mark.parametrize(
-    ("name", "before", "claimed", "message"),
-    [
-        (
-            "pcm16.wav",
-            b"data",
-            struct.pack("<I", 10**9),
-            r"is cut short: its header claims 10\d* bytes, 1244 are there",
-        ),
-        ("x.aiff", b"SSND", struct.pack(">I", 10**9), r"is cut short: its header claims 10\d* bytes, 1254 are there"),
-        # The low half of STREAMINFO's 36-bit number of samples.
-        ("x.flac", 18 + 5, struct.pack(">I", 10**6), "is cut short|cannot be read as an audio file"),
-        ("x.npy", b"(2, ", b"999", r"is damaged: .* 15984 bytes of data, shape \(2, 999\), but 4800 are there"),
-        ("four.mat", 4, struct.pack("<i", 10**9), r"is damaged: its header claims the shape \(1000000000, 1\)"),
-        ("plain.mat", b"\5\0\0\0\x08\0\0\0", struct.pack("<I", 10**9), r"the shape \(1000000000, 1\)"),
-    ],
-)
-def test_a_header_that_lies_is_refused(name, before, claimed, message, tmp_path):
-    WRITERS[name](tmp_path / name)
-    content = (tmp_path / name).read_bytes()
-    at = before if isinstance(before, int) else content.index(before) + len(before)
-    (tmp_path / name).write_bytes(content[:at] + claimed + content[at + len(claimed) :])
-    with pytest.raises(ValueError, match=rf"{name} .*({message})"):
-        read_recording(tmp_path / name, fs=FS)
 
 
 def test_a_file_without_samples_is_refused(tmp_path):
