@@ -43,8 +43,3 @@ def run(made, *, amplifier=None, feedback=None, on=0, n=N, **options):
         switch_on_s=on / FS,
         **options,
     )
-
-
-def sensor_noise(n=N):
-    """The sensor noise of `run`."""
-    return 0.05 * np.random.default_rng(11).standard_normal(n)

@@ -131,27 +131,21 @@ def test_scenarios_may_have_a_primary_path_that_changes() -> None:
 
 
 @pytest.mark.parametrize("fade", [0, 20])
-def test_a_simulated_interface_changes_too(fade: int) -> None:
+def test_a_simulated_interface_is_that_plant_and_changes_too(fade: int) -> None:
     """The blocks end between two changes, and in the midst of a cross-fade."""
-    plant = SimulatedInterface(
-        X,
-        SECONDARY,
-        primary_path=PRIMARY,
-        feedback_path=SILENT_FIRST,
-        fs=FS,
-        block=12,
-        latency=24,
-        crossfade_s=fade / FS,
-    )
+    paths: dict[str, Any] = {"primary_path": PRIMARY, "feedback_path": SILENT_FIRST, "crossfade_s": fade / FS}
+    others: dict[str, Any] = {"amplifier": HardClipAmplifier(0.8), "sensor_noise_std": 0.1, "rng": 3}
+    plant = SimulatedInterface(X, SECONDARY, fs=FS, block=12, latency=24, **paths, **others)
     y = np.random.default_rng(5).standard_normal(N)
     blocks = []
     while (block := plant.read()) is not None:
         plant.write(y[np.newaxis, 12 * len(blocks) : 12 * len(blocks) + 12])
         blocks.append(block)
-    played = np.concatenate((np.zeros(24), y[:-24]))
+    played = np.concatenate((np.zeros(24), np.clip(y[:-24], -0.8, 0.8)))
     found = [np.concatenate([getattr(block, name)[0] for block in blocks]) for name in ("references", "errors")]
     np.testing.assert_allclose(found[0], X + single(SILENT_FIRST, fade, played), rtol=0, atol=1e-13)
     expected = single(PRIMARY, fade, X) - single(SECONDARY, fade, played)
+    expected += 0.1 * np.random.default_rng(3).standard_normal(N)
     np.testing.assert_allclose(found[1], expected, rtol=0, atol=1e-13)
 
 

@@ -52,20 +52,6 @@ def test_a_users_controller_gets_arrays_and_the_signals_are_convolutions() -> No
     assert "2 loudspeaker(s), 3 microphone(s)" in repr(result)
 
 
-def test_feedback_and_amplifiers_act_on_each_loudspeaker() -> None:
-    feedback = random_paths(REFERENCES, J, 4, seed=3)
-    gains, y_amp = Fixed.gains, np.zeros((J, N))
-    heard, y = X.copy(), np.zeros((J, N))
-    for n in range(N):
-        for m in range(1, min(4, n + 1)):
-            heard[:, n] += feedback[:, :, m] @ y_amp[:, n - m]
-        y[:, n] = gains @ heard[:, n]
-        y_amp[:, n] = [np.tanh(y[0, n]), y[1, n]]
-    result = run(feedback_path=feedback, amplifier=[np.tanh, None])
-    np.testing.assert_allclose(result.control_signal, y, atol=1e-12)
-    np.testing.assert_allclose(result.amplifier_output, y_amp, atol=1e-12)
-
-
 def test_systems_are_a_matrix_of_paths() -> None:
     """Nested lists of control systems, shorter ones padded; the sampling rate is that of the systems."""
     taps = [[SECONDARY[k, j, : 9 - j] for j in range(J)] for k in range(K)]

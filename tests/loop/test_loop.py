@@ -1,12 +1,12 @@
-"""The loop against the plain-Python one of `oracles.modified_anc`, and its compiled form against its steps."""
+"""What must hold of the loop for any signal, its pieces, and filterpy's own filters in it."""
 
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 from helpers.comparing import SIGNALS, assert_same_run
-from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R, S, noises, run, sensor_noise
+from helpers.loop import FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R, S, noises, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import modified_anc as oracle
 
 from kfopc_filterpy import (
     KFOPC,
@@ -22,63 +22,16 @@ from kfopc_filterpy import (
 from kfopc_filterpy.loop.simulation import STRETCH
 
 
-def controller(name, *, rated_power=0.3, n_taps=N_TAPS):
+def controller(name, *, rated_power=0.3):
     kalman = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
     constraint = OutputPowerConstraint(rated_power, fs=FS, memory_s=MEMORY_S)
     if name == "KF-ANC":
-        return kf_anc(n_taps, S_HAT, **kalman)
+        return kf_anc(N_TAPS, S_HAT, **kalman)
     if name == "KF-OPC":
-        return kf_opc(n_taps, S_HAT, constraint=constraint, **kalman)
+        return kf_opc(N_TAPS, S_HAT, constraint=constraint, **kalman)
     if name == "FxLMS":
-        return FxLMS(n_taps, S_HAT, step_size=MU)
-    return MOVFxLMS(n_taps, S_HAT, step_size=MU, constraint=constraint)
-
-
-def reference_algorithm(name):
-    if name in ("KF-ANC", "FxLMS"):  # they only follow the powers, as eq. 10-11 with the defaults
-        factor = oracle.Factor(None)
-    else:
-        factor = oracle.Factor(0.3, None, MEMORY_S, FS, "exponential")
-    if name in ("KF-ANC", "KF-OPC"):
-        return oracle.Kalman(N_TAPS, factor, r=R, q=Q, p0=P0)
-    return oracle.LMS(N_TAPS, factor, mu=MU)
-
-
-NAMES = ("KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS")
-
-
-def assert_agrees(result, expected):
-    # Rounding of 500 steps in another order of summation. The loops contract, and where clipping makes weights grow
-    # they do so linearly; errors are some 1e-14 of the largest value, the Kalman covariance's some 1e-12.
-    for name in SIGNALS:
-        want, got = expected[name], getattr(result, name)
-        assert got.shape == want.shape, name
-        np.testing.assert_allclose(got, want, rtol=0, atol=1e-10 * np.nanmax(np.abs(want)), err_msg=name)
-
-
-@pytest.mark.parametrize(
-    ("amplifier", "feedback"), [("none", None), ("hard", FEEDBACK), ("soft", FEEDBACK)], ids=["", "hard", "soft"]
-)
-@pytest.mark.parametrize("name", NAMES)
-def test_every_controller_is_the_papers_loop(name, amplifier, feedback):
-    x, d, _ = noises()
-    ours, theirs = AMPLIFIERS[amplifier]
-    expected = oracle.modified_anc(
-        reference_algorithm(name),
-        x,
-        d,
-        S,
-        S_HAT,
-        noise=sensor_noise(),
-        amplifier=theirs,
-        feedback=(0.0,) if feedback is None else feedback,
-    )
-    result = run(controller(name), amplifier=ours, feedback=feedback)
-    assert_agrees(result, expected)
-    assert result.algorithm == name
-    assert (np.min(expected["constraint_factor"]) < 0.9) == (name in ("KF-OPC", "MOV-FxLMS"))  # it did act
-    if amplifier in ("hard", "soft"):
-        assert np.max(np.abs(expected["control_signal"])) > 0.7  # the amplifier did act
+        return FxLMS(N_TAPS, S_HAT, step_size=MU)
+    return MOVFxLMS(N_TAPS, S_HAT, step_size=MU, constraint=constraint)
 
 
 @pytest.mark.parametrize(("own", "rated_power"), [("filterpy", None), ("KFOPC", None), ("KFOPC", 0.3)])
@@ -89,7 +42,7 @@ def test_any_filterpy_filter_runs_in_the_loop(own, rated_power):
         constraint = OutputPowerConstraint(rated_power, fs=FS, memory_s=MEMORY_S) if rated_power else None
         estimator = KFOPC(dim_x=N_TAPS, dim_z=1, constraint=constraint)
     else:
-        estimator = oracle.KalmanFilter(dim_x=N_TAPS, dim_z=1)
+        estimator = KalmanFilter(dim_x=N_TAPS, dim_z=1)
     estimator.Q, estimator.R, estimator.P = R * np.eye(N_TAPS), np.array([[Q]]), P0 * np.eye(N_TAPS)
     generic, fast = run(KalmanController(estimator, S_HAT)), run(controller(name))
     assert generic.algorithm == name
@@ -119,7 +72,6 @@ def test_pieces_of_the_compiled_loop_do_not_show(name):
 @pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
 def test_scaled_noise_and_rated_power_scale_the_control(name, exponent, seed):
     """x, d by c, rated power, q, and 1/mu by c^2: the weights stay and y, e, y_amp grow by c (exactly: c = 2^k)."""
-    c = 2.0**exponent
     x, d, _ = noises(200, seed)
 
     def at_scale(c):
@@ -128,22 +80,13 @@ def test_scaled_noise_and_rated_power_scale_the_control(name, exponent, seed):
             made = kf_opc(N_TAPS, S_HAT, constraint=constraint, state_noise=R, measurement_noise=Q * c**2)
         else:
             made = MOVFxLMS(N_TAPS, S_HAT, step_size=MU / c**2, constraint=constraint)
-        return simulate(
-            made,
-            c * x,
-            disturbance=c * d,
-            secondary_path=S,
-            fs=FS,
-            amplifier=HardClipAmplifier(0.7 * c),
-            sensor_noise_std=0.05 * c,
-            rng=5,
-            record_weights_every=10,
-        )
+        plant = {"disturbance": c * d, "secondary_path": S, "amplifier": HardClipAmplifier(0.7 * c)}
+        noise = {"sensor_noise_std": 0.05 * c, "rng": 5}
+        return simulate(made, c * x, fs=FS, record_weights_every=10, **plant, **noise)
 
-    one, scaled = at_scale(1.0), at_scale(c)
-    np.testing.assert_array_equal(scaled.control_signal, c * one.control_signal)
-    np.testing.assert_array_equal(scaled.error, c * one.error)
-    np.testing.assert_array_equal(scaled.weights, one.weights)
+    one, scaled = at_scale(1.0), at_scale(2.0**exponent)
+    for signal, factor in (("control_signal", 2.0**exponent), ("error", 2.0**exponent), ("weights", 1.0)):
+        np.testing.assert_array_equal(getattr(scaled, signal), factor * getattr(one, signal))
     np.testing.assert_array_equal(scaled.constraint_factor, one.constraint_factor)
 
 

@@ -10,7 +10,6 @@ from helpers.simulation import MAKERS, D, Integrator, S, X, noises
 
 from kfopc_filterpy import FxLMS, FxNLMS, HardClipAmplifier, KalmanController, SoftSaturationAmplifier, simulate
 from kfopc_filterpy.filters import RandomWalkKFOPC
-from kfopc_filterpy.paths import fir_path
 
 # ---- What is recorded
 
@@ -36,15 +35,6 @@ def test_weights_are_recorded_after_samples_0_k_2k(every):
     np.testing.assert_array_equal(result.weights, whole.weights[::every])
     np.testing.assert_array_equal(result.weights_time_s, whole.time_s[::every])
     np.testing.assert_array_equal(result.error, whole.error)
-
-
-@pytest.mark.parametrize("given", ["taps", "system"])
-def test_primary_path_makes_the_disturbance(given):
-    p = np.random.default_rng(5).standard_normal(40)
-    primary, secondary = (p, S) if given == "taps" else (fir_path(p, 16000.0), fir_path(S, 16000.0))
-    result = simulate(MAKERS["FxLMS"](), X, primary_path=primary, secondary_path=secondary)
-    expected = [sum(p[k] * X[n - k] for k in range(min(40, n + 1))) for n in range(X.size)]
-    np.testing.assert_allclose(result.disturbance, expected, rtol=0, atol=1e-13)
 
 
 def test_sensor_noise_is_in_the_error_alone():

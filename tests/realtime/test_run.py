@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from kfopc_filterpy import FxLMS, HardClipAmplifier, simulate, suggest_settings
+from kfopc_filterpy import FxLMS, suggest_settings
 from kfopc_filterpy.bounds import predictor_reference
 from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.realtime import (
@@ -54,32 +54,6 @@ class Recorded(SimulatedInterface):
 def started(interface: Interface, step_size: float = 2e-3, **changed: Any) -> Any:
     settings = {"amplitude_limit": 8.0, "listen_s": 0.5, "identify_s": 1.5, "fade_s": 0.02}
     return run(lambda path: FxLMS(24, path.taps, step_size=step_size), interface, **settings | changed)
-
-
-def test_the_simulated_plant_is_that_of_simulate() -> None:
-    """With clipping and feedback: the same controller, block by block and in one simulation with the delay in the path."""
-    clip, feedback = HardClipAmplifier(0.8), np.array([0.0, 0.05, -0.02])
-    options: dict[str, Any] = {"sensor_noise_std": 0.1, "rng": 3}
-    interface = plant(amplifier=clip, feedback_path=feedback, **options)
-    controller = FxLMS(24, interface.total_secondary_path, step_size=1e-3)
-    errors, outputs = [], []
-    while (block := interface.read()) is not None:
-        errors.append(block.errors[0])
-        outputs.append(controller.process(block.references[0], block.errors[0]))
-        interface.write(outputs[-1][np.newaxis])
-    expected = simulate(
-        FxLMS(24, interface.total_secondary_path, step_size=1e-3),
-        X,
-        primary_path=PRIMARY,
-        secondary_path=interface.total_secondary_path,
-        amplifier=clip,
-        feedback_path=np.concatenate((np.zeros(64), feedback)),
-        fs=FS,
-        **options,
-    )
-    # The sums are in another order; the loop contracts, so rounding stays small.
-    np.testing.assert_allclose(np.concatenate(outputs), expected.control_signal, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(np.concatenate(errors), expected.error, rtol=0, atol=1e-10)
 
 
 def test_a_real_clock_waits_for_the_blocks_and_loses_those_not_fetched() -> None:

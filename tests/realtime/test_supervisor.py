@@ -312,16 +312,6 @@ def test_surprising_innovations_are_a_divergence() -> None:
     assert supervisor.health.counts["diverged: innovation"] >= 1
 
 
-def test_a_control_signal_that_is_not_finite_ends_in_silence() -> None:
-    broken = Playing(lambda n: 1.0 if n % 200 else np.nan)
-    supervisor = Supervisor(broken, fs=FS, amplitude_limit=2.0, pause_s=0.1)
-    y = heard(supervisor, np.random.default_rng(0), 40, 64)
-    assert np.all(np.isfinite(y))
-    assert supervisor.health.counts["diverged: not finite"] >= 1
-    assert np.max(np.abs(np.diff(y[:200]))) < 1.0 / 50  # it fades, it does not click
-    assert not np.any(y[256:800])
-
-
 def test_long_faults_fade_out_and_in_again() -> None:
     def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[Any, Any]:
         return x, (np.full_like(e, np.nan) if 8000 <= first < 20000 else e)
@@ -432,6 +422,9 @@ def test_a_pause_lasts_as_long_as_it_says_and_its_end_is_noted_once(user: str) -
             supervisor.fade_out()
         y.append(supervisor.process(*rng.standard_normal((2, 64))))
     again = [event.time_s for event in supervisor.health.events if event.what == "running again"]
+    assert supervisor.health.counts["diverged: not finite"] == 1
+    assert np.all(np.isfinite(y))
+    assert np.max(np.abs(np.diff(np.ravel(y[:5])))) < 1.0 / 50  # it fades, it does not click
     assert np.any(y[3])
     assert not np.any(y[4:17])
     if user == "leaves it alone":
