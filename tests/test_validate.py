@@ -1,6 +1,5 @@
 """Each check of arguments, once: what it takes, what it refuses, and that the message names the argument."""
 
-import datetime
 from functools import partial
 
 import numpy as np
@@ -47,30 +46,22 @@ def test_what_is_taken():
     [
         (as_signal, [[1.0]], ValueError, r"x must be one-dimensional.*pass one channel, e.g. x\[0\] or x.ravel"),
         (as_signal, [], ValueError, "x must have at least 1 value"),
-        (partial(as_signal, length=3), [1.0], ValueError, "x must have 3 values, got 1"),
         (as_signal, [0.0, np.nan], ValueError, r"x must be finite, but holds NaN or Inf \(first at index 1\)"),
         (as_signal, [10**400], ValueError, "too large for a float"),
         (as_real_array, [[1.0], [1.0, 2.0]], TypeError, "got list, whose rows differ in length"),
         (as_real_array, [1j], TypeError, "x must be a sequence of real numbers, got complex ones"),
-        (as_real_array, ["a"], TypeError, "got list"),
         (as_real_array, [1.0, "a"], TypeError, "x must be a sequence of real numbers"),
-        (as_real_array, [1.0, MASKED], TypeError, "x must be"),
         (as_real_array, np.array([1.0, "a"], dtype=object), TypeError, "text, dates or masked values among them"),
-        (as_real_array, [datetime.date(2020, 1, 1)], TypeError, "x must be"),
-        (as_channels, 1.0, ValueError, r"x must be \(n_samples,\) or \(n_channels, n_samples\), got shape \(\)"),
         (as_channels, np.ones((0, 4)), ValueError, "x must have at least 1 value"),
         (as_channels, np.ones((3, 2)), ValueError, r"x must have its channels first.* transpose it, x.T"),
         (as_channels, [[0.0, 1.0], [np.inf, 0.0]], ValueError, r"first at index \(1, 0\)"),
         (as_number, None, TypeError, "x must be a single number, got None"),
-        (as_number, "1", TypeError, "x must be a single number"),
         (as_number, [1.0, 2.0], TypeError, "x must be a single number"),
-        (as_number, 1j, TypeError, "x must be a single number"),
         (as_number, np.inf, ValueError, "x must be finite, got inf"),
         (as_number, MASKED[1], ValueError, "x must be finite, got a masked value"),
         (partial(as_positive, unit="Hz"), 0.0, ValueError, "x must be greater than 0 Hz, got 0"),
         (as_nonnegative, -1e-300, ValueError, "x must not be negative"),
         (as_rate, 9e-4, ValueError, "x must be a sampling rate from 0.001"),
-        (as_rate, 1.1e9, ValueError, "x must be a sampling rate from 0.001"),
         (as_count, 0, ValueError, "x must be at least 1, got 0"),
         (as_count, 1.0, TypeError, "x must be a whole number"),
         (partial(as_choice, choices=("a", "b")), "c", ValueError, "x must be one of 'a', 'b', got 'c'"),
@@ -78,16 +69,14 @@ def test_what_is_taken():
         (lambda value, name: per_loudspeaker(value, 2, name), [1.0, 0.0], ValueError, "x must be greater than 0"),
         (lambda value, name: pair(value, name=name), 100.0, ValueError, r"x must be a pair \(low, high\)"),
         (lambda value, name: pair(value, name=name), (-1.0, 5.0), ValueError, "x must satisfy"),
-        (lambda value, name: pair(value, name=name), (5.0, 5.0), ValueError, "x must satisfy"),
         (lambda value, name: pair(value, name=name), (5.0, 8001.0), ValueError, "fs/2 = 8000 Hz, got"),
         (lambda value, _: as_rate_ratio(16000, value), 16000 * np.pi, ValueError, "in a ratio of whole numbers"),
-        (lambda value, _: as_rate_ratio(16000, value), 0.01, ValueError, "in a ratio of whole numbers"),
         (lambda value, name: as_sample_count(value, 10, name), 0.05, ValueError, "x must be at least one sample, 0.1"),
         (lambda value, name: as_sample_count(1e300, value, name), 1e300, ValueError, "a finite number of samples"),
         (lambda value, name: as_sample_count(1.0, value, name), 0, ValueError, "fs must be greater than 0 Hz"),
         (lambda value, _: as_generator(value), None, TypeError, "rng must be a seed or a numpy.random.Generator"),
     ],
-    ids=range(41),
+    ids=range(31),
 )
 def test_what_is_refused(check, value, error, message):
     with pytest.raises(error, match=message):

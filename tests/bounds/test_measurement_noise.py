@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.signal
+from helpers.channels import delayed
 
 from kfopc_filterpy.bounds import measurement_noise_from_residual, measurement_noise_from_run
 from kfopc_filterpy.bounds.wiener import wiener_solution
@@ -34,9 +35,8 @@ def test_has_no_bias_from_the_weights_fitted():
 @pytest.mark.parametrize("n_taps", [1, 5, 33])
 def test_is_the_residual_of_least_squares(n_taps):
     x, d = recording(900, 5, 0.04, 1)
-    filtered = np.convolve(x, S)[:900]
     start = n_taps + S.size - 2  # delay lines full
-    rows = np.array([filtered[n - n_taps + 1 : n + 1][::-1] for n in range(start, 900)])
+    rows = delayed(np.convolve(x, S)[None, :900], n_taps)[:, start:].T
     _, (squares,), rank, _ = np.linalg.lstsq(rows, d[start:], rcond=None)
     assert rank == n_taps
     expected = squares / (len(rows) - n_taps)

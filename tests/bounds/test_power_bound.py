@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import scipy.signal
+from helpers.channels import delayed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -35,7 +36,7 @@ def scene(n=1000, seed=0, noise=0.1, path=(0.0, 0.8, 0.3, -0.1)):
 
 def delay_lines(signal, n_taps, start, stop):
     """Return rows of the true past, newest first, with zeros before the first sample."""
-    return np.array([[signal[n - j] if n >= j else 0.0 for j in range(n_taps)] for n in range(start, stop)])
+    return delayed(np.atleast_2d(signal), n_taps)[:, start:stop].T
 
 
 def dense(x, d, s, n_taps, start, stop):
@@ -211,12 +212,10 @@ def test_units_do_not_matter(gain):
     x, d, s = scene()
     rated = 0.2 * asked_for(x, d, s, 8)
     one = power_constrained_wiener(x, d, s, 8, rated, fs=FS)
-    others = [
-        (power_constrained_wiener(gain * x, d, s, 8, rated, fs=FS), 1 / gain),  # the reference's unit
-        (power_constrained_wiener(x, gain * d, s, 8, gain**2 * rated, fs=FS), gain),  # the disturbance's
-        (power_constrained_wiener(x, d, gain * s, 8, rated / gain**2, fs=FS), 1 / gain),  # the path's
-    ]
-    for other, factor in others:
+    # The units of the reference, of the disturbance and of the path, and what they make of the weights.
+    scales = [(gain, 1, 1, 1 / gain), (1, gain, 1, gain), (1, 1, gain, 1 / gain)]
+    for of_x, of_d, of_s, factor in scales:
+        other = power_constrained_wiener(of_x * x, of_d * d, of_s * s, 8, (of_d / of_s) ** 2 * rated, fs=FS)
         np.testing.assert_allclose(other.per_second.weights, factor * one.per_second.weights, rtol=1e-7)
         assert other.whole.noise_reduction_db == pytest.approx(one.whole.noise_reduction_db, abs=1e-9)
 
@@ -336,29 +335,29 @@ def test_solution_over_full_delay_lines_is_the_same():
 def test_noise_reduction_over_a_part_is_that_of_its_samples():
     x, d, s = scene()
     found = power_constrained_wiener(x, d, s, 8, 0.3 * asked_for(x, d, s, 8), fs=FS)
-    solutions = ("whole", "per_second", "unconstrained", "scaled", "scaled_per_second")
-    steady = found.noise_reduction_over(0.5 * found.whole.end_s)
-    part = found.noise_reduction_over(0.5, 1.75)
-    everything = found.noise_reduction_over()
-    assert tuple(part) == solutions
-    for name in solutions:
-        error = getattr(found, name).error
-        assert steady[name] == pytest.approx(noise_reduction_db(error, d), abs=1e-12)
-        ratio = np.sum(error[100:350] ** 2) / np.sum(d[100:350] ** 2)
-        assert part[name] == pytest.approx(-10 * np.log10(ratio), abs=1e-12)
-        assert everything[name] == pytest.approx(getattr(found, name).noise_reduction_db, abs=1e-12)
+    for part, samples in (
+        ((0.5 * found.whole.end_s,), slice(500, 1000)),
+        ((0.5, 1.75), slice(100, 350)),
+        ((), slice(0, 1000)),
+    ):
+        reductions = found.noise_reduction_over(*part)
+        assert tuple(reductions) == ("whole", "per_second", "unconstrained", "scaled", "scaled_per_second")
+        for name, reduction in reductions.items():
+            error = getattr(found, name).error[samples]
+            assert reduction == pytest.approx(noise_reduction_db(error, d[samples], steady=1.0), abs=1e-12)
+    for part in ((5.0, None), (2.0, 1.0), (0.0, 5.5)):
+        with pytest.raises(ValueError, match="start_s and end_s must mark a part of the 5 s that count, got"):
+            found.noise_reduction_over(*part)
 
 
 def test_results_outlive_the_arrays_they_came_from():
     x, d, s = scene()
     found = power_constrained_wiener(x, d, s, 8, 0.1, fs=FS)
-    before = found.per_second.error
-    x *= 2
-    d *= 3
+    before = found.per_second.error.copy()
+    x[:], d[:] = 0.0, 0.0
     np.testing.assert_array_equal(found.per_second.error, before)
-    for array in (found.disturbance, found.whole.weights, found.per_second.segments[0].weights):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        found.whole.weights[0] = 1.0
 
 
 def test_system_and_taps_give_the_same():
@@ -389,20 +388,6 @@ def test_bad_input_is_refused(change, message):
     arguments = {"reference": x, "disturbance": d, "secondary_path": s, "n_taps": 8, "rated_power": 0.1, "fs": FS}
     with pytest.raises(ValueError, match=message):
         power_constrained_wiener(**arguments | change)
-
-
-@pytest.mark.parametrize(
-    ("start_s", "end_s", "message"),
-    [
-        (5.0, None, "start_s and end_s must mark a part of the 5 s that count, got 5 s to 5 s"),
-        (2.0, 1.0, "got 2 s to 1 s"),
-    ],
-)
-def test_parts_outside_the_record_are_refused(start_s, end_s, message):
-    x, d, s = scene()
-    found = power_constrained_wiener(x, d, s, 8, 0.1, fs=FS)
-    with pytest.raises(ValueError, match=message):
-        found.noise_reduction_over(start_s, end_s)
 
 
 @pytest.mark.parametrize("window_s", [0.02, 0.1, 1.0])

@@ -30,12 +30,7 @@ def test_scaled_filter_reaches_the_reduction_at_that_power():
     s = np.array([0.0, 0.7, 0.4])
     d = scipy.signal.lfilter([0, 0, 1.0, -0.4, 0.2], 1.0, x)
     best = wiener_solution(x, d, s, 16)
-    needed = required_rated_power(
-        [3.0, 6.0, 10.0],
-        disturbance_power=best.disturbance_power,
-        antinoise_power=best.antinoise_power,
-        control_power=best.control_power,
-    )
+    needed = required_rated_power([3.0, 6.0, 10.0], **{name: getattr(best, name) for name in POWERS})
     start = 16 + 3 - 2
     for wanted, factor, power in zip([3.0, 6.0, 10.0], needed.constraint_factor, needed.rated_power, strict=True):
         y = scipy.signal.lfilter(factor * best.weights, 1.0, x)
@@ -86,7 +81,7 @@ def bound(rated_power):
 
 def test_scaled_filters_of_several_loudspeakers_reach_the_reduction_at_those_powers():
     free = bound(1e6).unconstrained
-    powers = {name: getattr(free, name) for name in ("disturbance_power", "antinoise_power", "control_power")}
+    powers = {name: getattr(free, name) for name in POWERS}
     needed = required_rated_power([0.5, 1.5], **powers)
     assert needed.rated_power.shape == (2, J)
     assert required_rated_power(0.5, **powers).rated_power.shape == (J,)

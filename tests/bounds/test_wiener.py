@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 import scipy.signal
+from helpers.channels import delayed
 
 from kfopc_filterpy.bounds import coherence_bound, wiener_solution
 from kfopc_filterpy.bounds.power_constrained import power_constrained_solution, power_constrained_wiener
@@ -23,10 +24,6 @@ def _scene(n=3000, seed=0):
     return x, d, np.array([0.0, 0.8, 0.3, -0.1])
 
 
-def _regressors(signal, n_taps, start):
-    return np.array([signal[n - n_taps + 1 : n + 1][::-1] for n in range(start, signal.size)])
-
-
 @pytest.mark.parametrize(
     ("n_taps", "ridge", "penalty"), [(1, 0.0, 0.0), (16, 0.0, 0.0), (7, 0.01, 0.0), (7, 0.0, 0.5), (2, 0.02, 0.3)]
 )
@@ -34,7 +31,7 @@ def test_weights_are_those_of_dense_least_squares(n_taps, ridge, penalty):
     x, d, s = _scene()
     start = n_taps + s.size - 2
     filtered = scipy.signal.lfilter(s, 1.0, x)
-    rows, control_rows = _regressors(filtered, n_taps, start), _regressors(x, n_taps, start)
+    rows, control_rows = (delayed(signal[None], n_taps)[:, start:].T for signal in (filtered, x))
     scale = np.sqrt(ridge * np.sum(filtered[start:] ** 2))
     matrix = np.vstack([rows, np.sqrt(penalty) * control_rows, scale * np.eye(n_taps)])
     right = np.concatenate([d[start:], np.zeros(len(control_rows) + n_taps)])
@@ -61,7 +58,7 @@ def test_tone_has_the_minimum_norm_solution():
     steady_s = np.exp(-2j * np.pi * 400 / FS * np.arange(32)) @ s
     # s*x without start-up, so that the oracle's matrix has rank two exactly as well.
     filtered = np.imag(steady_s * np.exp(2j * np.pi * 400 * n / FS))
-    expected = np.linalg.lstsq(_regressors(filtered, 64, start), d[start:], rcond=1e-6)[0]
+    expected = np.linalg.lstsq(delayed(filtered[None], 64)[:, start:].T, d[start:], rcond=1e-6)[0]
     # The first rows of x' still hold start-up of up to 1e-3 in the filter's first 63 samples.
     np.testing.assert_allclose(found.weights, expected, atol=2e-3)
     assert np.linalg.norm(found.weights) < 1.05 * np.linalg.norm(expected)
@@ -110,7 +107,7 @@ def narrow(n=12_000, seed=0):
 
 def dense_reduction_db(x, d, s, n_taps):
     start = n_taps + s.size - 2
-    rows = np.lib.stride_tricks.sliding_window_view(scipy.signal.lfilter(s, 1.0, x), n_taps)[start - n_taps + 1 :, ::-1]
+    rows = delayed(np.convolve(x, s)[None, : x.size], n_taps)[:, start:].T
     weights = np.linalg.lstsq(rows, d[start:], rcond=None)[0]
     error = d[start:] - rows @ weights
     return -10 * np.log10(np.mean(error**2) / np.mean(d[start:] ** 2)), np.abs(weights).max()

@@ -4,6 +4,7 @@ import control
 import numpy as np
 import pytest
 import scipy.signal
+from helpers.channels import delayed
 
 from kfopc_filterpy.paths import estimate_path, identify_secondary_path
 from kfopc_filterpy.paths.path_matrix import path_matrix
@@ -22,17 +23,13 @@ def recordings(n=600, noise=0.05, seed=0):
     return sent, heard + noise * rng.standard_normal(heard.shape)
 
 
-def delays_of(signal, n_taps):
-    return np.lib.stride_tricks.sliding_window_view(signal, n_taps)[:, ::-1]
-
-
 @pytest.mark.parametrize("n_loudspeakers", [1, 2])
 @pytest.mark.parametrize("regularization", [0.0, 1e-3])
 def test_loudspeakers_at_once_are_one_least_squares_problem(regularization, n_loudspeakers):
     sent, heard = (signals[:n_loudspeakers] for signals in recordings())
     together = heard.sum(axis=0)
     found = estimate_path(sent, together, N_TAPS, FS, regularization=regularization)
-    rows = np.hstack([delays_of(signal, N_TAPS) for signal in sent])
+    rows = delayed(sent, N_TAPS)[:, N_TAPS - 1 :].T
     target = together[:, N_TAPS - 1 :].T
     # A ridge is least squares with a row for each weight.
     powers = [np.mean(signal[N_TAPS - 1 :] ** 2) for signal in sent]
