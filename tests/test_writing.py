@@ -167,14 +167,8 @@ def test_an_interrupted_verdict_leaves_the_folder_as_it_was(tmp_path):
     (tmp_path / "out" / "verdict.html").write_text("an older page")
     before = contents(tmp_path)
     command = [sys.executable, "-m", "kfopc_filterpy", "verdict", *SCENE, "--rated-power", "4", "-o", "out", "--quiet"]
-    with subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as running:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, **pipes) as running:
         assert running.stdout.readline()  # the verdict is told, and the page begun
         running.send_signal(signal.SIGINT)
         _, errors = running.communicate(timeout=60)

@@ -179,27 +179,6 @@ def test_systems_generators_and_other_sequences_one_each():
 # ---- The controllers afterwards
 
 
-@pytest.mark.parametrize("window", ["exponential", "sliding"])
-def test_controllers_go_on(window):
-    """In scenarios again, alone, by hand; the one that did none of it as if nothing had been."""
-    made, alone = filters(4, window=window), filters(4, window=window)
-    for seed, n in ((3, 300), (4, 77)):
-        x, own = differing(4, n, seed)
-        results = run_scenarios(made, x, fs=FS, **own)
-        assert_as_alone(results, one_by_one(alone, x, own), made, alone)
-    for i in (2, 0):
-        mine = {name: values[i : i + 1] for name, values in own.items()}
-        assert_as_alone(*(one_by_one([c[i]], x, mine) for c in (made, alone)))
-    for c in (made[1], alone[1]):
-        for reference, error in zip(x[:5], own["disturbance"][1, :5], strict=True):
-            c.control_signal(reference)
-            c.update(error)
-    assert_as_alone((), (), made, alone)
-    mine = {name: values[3:] for name, values in own.items()}
-    results = run_scenarios(made[3:], x, fs=FS, **mine)
-    assert_as_alone(results, one_by_one(alone[3:], x, mine), made, alone)
-
-
 def test_an_interrupted_run_leaves_the_controllers_as_they_were():
     """All or nothing: a covariance a block ahead of the weights would be neither."""
     x, own = differing(9, 3 * STRETCH)
