@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from kfopc_filterpy import kf_opc, kf_opc_repaired, kf_pb, simulate
-from kfopc_filterpy.paths import read_path
-from kfopc_filterpy.signals import Recording, read_recording, write_wav
+from kfopc_filterpy.signals import Recording
 
 FS = 8000
 NOISE = np.random.default_rng(0).standard_normal(8000)
@@ -18,16 +17,13 @@ def recorded(samples) -> Recording:
     return Recording(samples, FS)
 
 
-def test_a_run_takes_recordings(tmp_path):
-    for name, samples in (("noise", NOISE), ("P", PRIMARY[0]), ("S", SECONDARY)):
-        write_wav(tmp_path / f"{name}.wav", samples, FS)
-    noise = read_recording(tmp_path / "noise.wav")
-    primary, secondary = (read_path(tmp_path / f"{name}.wav") for name in "PS")
-    results = [
-        simulate(kf_pb(32, s, rated_power=0.5, fs=noise.fs), x, primary_path=p, secondary_path=s, fs=noise.fs).error
-        for x, p, s in ((noise, primary, secondary), (noise.samples, primary.samples, secondary.samples))
-    ]
-    np.testing.assert_array_equal(*results)
+def test_a_run_takes_recordings():
+    errors = []
+    for kind in (np.asarray, recorded):
+        x, primary, secondary = kind(NOISE), kind(PRIMARY[0]), kind(SECONDARY)
+        controller = kf_pb(32, secondary, rated_power=0.5, fs=FS)
+        errors.append(simulate(controller, x, primary_path=primary, secondary_path=secondary, fs=FS).error)
+    np.testing.assert_array_equal(*errors)
 
 
 @pytest.mark.parametrize("kind", [np.asarray, recorded])
