@@ -69,6 +69,7 @@ def test_what_is_taken():
         (lambda value, name: per_loudspeaker(value, 2, name), [1.0, 0.0], ValueError, "x must be greater than 0"),
         (lambda value, name: pair(value, name=name), 100.0, ValueError, r"x must be a pair \(low, high\)"),
         (lambda value, name: pair(value, name=name), (-1.0, 5.0), ValueError, "x must satisfy"),
+        (lambda value, name: pair(value, name=name), (5.0, 5.0), ValueError, "x must satisfy"),
         (lambda value, name: pair(value, name=name), (5.0, 8001.0), ValueError, "fs/2 = 8000 Hz, got"),
         (lambda value, _: as_rate_ratio(16000, value), 16000 * np.pi, ValueError, "in a ratio of whole numbers"),
         (lambda value, name: as_sample_count(value, 10, name), 0.05, ValueError, "x must be at least one sample, 0.1"),
@@ -76,7 +77,7 @@ def test_what_is_taken():
         (lambda value, name: as_sample_count(1.0, value, name), 0, ValueError, "fs must be greater than 0 Hz"),
         (lambda value, _: as_generator(value), None, TypeError, "rng must be a seed or a numpy.random.Generator"),
     ],
-    ids=range(31),
+    ids=range(32),
 )
 def test_what_is_refused(check, value, error, message):
     with pytest.raises(error, match=message):
