@@ -46,17 +46,20 @@ def test_what_is_taken():
     [
         (as_signal, [[1.0]], ValueError, r"x must be one-dimensional.*pass one channel, e.g. x\[0\] or x.ravel"),
         (as_signal, [], ValueError, "x must have at least 1 value"),
+        (partial(as_signal, length=3), [1.0], ValueError, "x must have 3 values, got 1"),
         (as_signal, [0.0, np.nan], ValueError, r"x must be finite, but holds NaN or Inf \(first at index 1\)"),
         (as_signal, [10**400], ValueError, "too large for a float"),
         (as_real_array, [[1.0], [1.0, 2.0]], TypeError, "got list, whose rows differ in length"),
         (as_real_array, [1j], TypeError, "x must be a sequence of real numbers, got complex ones"),
         (as_real_array, [1.0, "a"], TypeError, "x must be a sequence of real numbers"),
         (as_real_array, np.array([1.0, "a"], dtype=object), TypeError, "text, dates or masked values among them"),
+        (as_channels, 1.0, ValueError, r"x must be \(n_samples,\) or \(n_channels, n_samples\), got shape \(\)"),
         (as_channels, np.ones((0, 4)), ValueError, "x must have at least 1 value"),
         (as_channels, np.ones((3, 2)), ValueError, r"x must have its channels first.* transpose it, x.T"),
         (as_channels, [[0.0, 1.0], [np.inf, 0.0]], ValueError, r"first at index \(1, 0\)"),
         (as_number, None, TypeError, "x must be a single number, got None"),
         (as_number, [1.0, 2.0], TypeError, "x must be a single number"),
+        (as_number, 1j, TypeError, "x must be a single number"),
         (as_number, np.inf, ValueError, "x must be finite, got inf"),
         (as_number, MASKED[1], ValueError, "x must be finite, got a masked value"),
         (partial(as_positive, unit="Hz"), 0.0, ValueError, "x must be greater than 0 Hz, got 0"),
@@ -77,7 +80,7 @@ def test_what_is_taken():
         (lambda value, name: as_sample_count(1.0, value, name), 0, ValueError, "fs must be greater than 0 Hz"),
         (lambda value, _: as_generator(value), None, TypeError, "rng must be a seed or a numpy.random.Generator"),
     ],
-    ids=range(32),
+    ids=range(35),
 )
 def test_what_is_refused(check, value, error, message):
     with pytest.raises(error, match=message):

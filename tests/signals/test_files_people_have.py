@@ -57,6 +57,7 @@ def test_a_heading_gives_the_unit_of_the_times(tmp_path, header, unit, encoding)
         ("0,2048\n1,2051\n2,2049\n", [2048, 2051, 2049]),  # the first column counts
         ("left,right\n5,2048\n3,2051\n9,7\n", [[5, 3, 9], [2048, 2051, 7]]),
         ("left,right\n0,1\n1,2\n3,3\n4,4\n", [[0, 1, 3, 4], [1, 2, 3, 4]]),  # that rises, and is no time
+        ("5,2048\n3,-2051\n9,7\n", [[5, 3, 9], [2048, -2051, 7]]),
         ("Pegel\n0,512\n-0,250\n", [0.512, -0.25]),
         ("0,512\n-0,250\n", [0.512, -0.25]),
         ("1,5E-1\n2,5E-1\n", [0.15, 0.25]),
