@@ -144,6 +144,7 @@ NOISES = np.random.default_rng(0).standard_normal((3, 100))
         ([NOISES[0, 2:], -NOISES[0, :-2]], NOISES[:, 2:], r"excitation\[1\] must not be correlated"),
         (NOISES[:2] * [[1], [0]], NOISES, r"excitation\[1\] must not be silent"),
         (NOISES[:2], NOISES * [[1], [1], [0]], r"response\[2\] must not be silent"),
+        (NOISES[:2], NOISES[:, :-1], "response must have 100 samples, as excitation has, got 99"),
         (NOISES[:2], NOISES[np.newaxis].repeat(3, 0), r"excitation must be .* = \(3, 100\) for a response of shape .*"),
         (NOISES[0], NOISES[:2, np.newaxis] * [[[1]], [[0]]], r"response\[1\]\[0\] must not be silent"),
         (NOISES[0], np.zeros((0, 2, 100)), r"response must be \(J loudspeakers, K microphones, n_samples\), got shape"),
