@@ -311,6 +311,7 @@ def test_a_faulty_file_says_what_to_mend(fault: str, tmp_path: Path) -> None:
     ("entries", "says"),
     [
         ({}, ""),
+        ({"name": None}, "its first entry must be the algorithm's name"),
         ({"settings": []}, "its settings must be an array that ends with {0}, also if there is none"),
         ({"layout": None, "start": None}, "it has no layout and no start; it must be {name, settings, layout, start,"),
         ({"settings": [("a", 0, 0), ("b", 2, 1)]}, "the range of b is from 2 to 1, which is empty"),
