@@ -139,6 +139,7 @@ ITSELF[0].append(ITSELF)
         (Inside(Odd()), r"KFOPC\.own cannot be saved"),
         (new_filter().predict, r"KFOPC\.own cannot be saved.*predict"),
         (np.ma.masked_array([1.0], [True]), r"KFOPC\.own cannot be saved"),
+        (np.random.RandomState(1), r"KFOPC\.own cannot be saved"),
         ([].append, r"KFOPC\.own cannot be saved.*append"),
         (np.zeros(2, [("a", [("b", "f8")])]), r"KFOPC\.own cannot be saved.* an array of"),
         (np.zeros(2, [("a", "O")]), r"KFOPC\.own cannot be saved.* an array of"),
