@@ -36,9 +36,9 @@ def test_the_columns_of_an_older_tektronix_stand_beside_its_header(tmp_path):
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16"])
 def test_a_heading_gives_the_unit_of_the_times(tmp_path, header, unit, encoding):
-    scale = {"s": 1.0, "ms": 1e3, "ns": 1e9}.get(unit, 1e6)
-    interval = round(scale / 48000, 6)  # rounded itself, as some write it, but for seconds
-    rows = "".join(f"{n * (interval if unit != 's' else 1 / 48000):.6f},{n % 3}\n" for n in range(300))
+    interval = {"s": 1.0, "ms": 1e3, "ns": 1e9}.get(unit, 1e6) / 48000
+    interval = interval if unit == "s" else round(interval, 6)  # some round it before they multiply
+    rows = "".join(f"{n * interval:.6f},{n % 3}\n" for n in range(300))
     (tmp_path / "x.csv").write_text(f"{header}\n{rows}", encoding=encoding)
     recording = read_recording(tmp_path / "x.csv")
     assert (recording.fs, recording.samples.shape) == (48000, (300,))
