@@ -119,7 +119,10 @@ def test_folder_argument_comes_before_the_environment(load, own_files, data_fold
 @pytest.mark.parametrize("load", [load_measured_duct, load_measured_room])
 def test_an_empty_environment_variable_names_no_folder(load, source, data_folder, tmp_path):
     data_folder("")
-    with pytest.raises(DataUnavailableError, match=r"\.mat is missing: put .* or name another folder .*; without a folder, allow_download=True"):
+    with pytest.raises(
+        DataUnavailableError,
+        match=r"\.mat is missing: put .* or name another folder .*; without a folder, allow_download=True",
+    ):
         load()
     assert source.asked == []
     assert dataset_folder() == tmp_path / "cache" / "kfopc_filterpy"
