@@ -173,5 +173,5 @@ def test_an_interrupted_verdict_leaves_the_folder_as_it_was(tmp_path):
         running.send_signal(signal.SIGINT)
         _, errors = running.communicate(timeout=60)
     assert running.returncode == 130
-    assert errors.endswith("kfopc verdict: interrupted; each file is as it was, or was written whole\n")
+    assert errors.endswith("kfopc: interrupted; each file is as it was, or was written whole\n")
     assert contents(tmp_path) == before

@@ -248,18 +248,17 @@ def test_control_that_is_switched_on_later(name: str, scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("name", ["KF-OPC", "diagonal KF-OPC"])
-@pytest.mark.parametrize("unheard", [[1], [0, 1]], ids=["one", "both"])
-def test_a_loudspeaker_that_no_microphone_hears(unheard: list[int], name: str) -> None:
-    """Its factor of zero does not count, unless there is no other."""
+def test_a_loudspeaker_that_no_microphone_hears(name: str) -> None:
+    """Its factor of zero does not count."""
     scene = Scene(several=True)
-    scene.s_hat[:, unheard] = 0.0
+    scene.s_hat[:, 1] = 0.0
     controller, oracle = pair(name, scene)
     x, d = scene.noises(300)
     expected = signals.run(oracle, x, d, scene.s)
     result = simulate(controller, x, disturbance=d, secondary_path=scene.s, fs=FS)
     np.testing.assert_allclose(result.constraint_factor, expected.alphas, rtol=0, atol=TOLERANCE)
     np.testing.assert_allclose(controller.weights, expected.w, rtol=0, atol=TOLERANCE)
-    assert np.any(controller.weights != 0.0) == (len(unheard) == 1)
+    assert np.any(controller.weights != 0.0)
 
 
 @pytest.mark.parametrize("limit", [{}, {"amplitude_limit": 0.5}], ids=["", "amplitude limit"])
