@@ -73,6 +73,7 @@ html_theme = "furo"
 html_static_path = ["_static", mathjax_file()]
 html_css_files = ["wide.css"]
 html_title = f"{project} {version}"
+html_baseurl = os.environ.get("READTHEDOCS_CANONICAL_URL", "")  # where search engines find the newest version
 html_search_scorer = str(Path(__file__).parent / "extensions" / "scorer.js")
 copybutton_exclude = ".linenos, .gp, .go"  # what is copied has no prompts and no output
 html_copy_source = False
