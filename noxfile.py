@@ -4,8 +4,8 @@
 # ///
 """Tasks: `nox -l` lists them, `nox -s docs` runs one. What follows `--` goes to pytest, Sphinx, the studies or cosmic-ray.
 
-`.ci/run` runs those marked with a star, `.ci/slow` runs bare, wheels, slow and fuzz; both bring nox. Sessions that leave
-cores idle may run beside one another (`nox -j 2`).
+`.ci/run` runs those marked with a star, `.ci/slow` runs bare, wheels, slow and fuzz; both install nox. Sessions that
+leave cores idle may run beside one another (`nox -j 2`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import nox
 nox.needs_version = ">=2026.8.10"
 nox.options.default_venv_backend = "virtualenv"  # its environments have pip, which some sessions run
 nox.options.error_on_missing_interpreters = True
-signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, at which nox ends what runs beside
+signal.signal(signal.SIGTERM, signal.default_int_handler)  # like Ctrl-C, at which nox ends the other sessions
 
 PINNED = ("-c", "constraints.txt")
 PROJECT = nox.project.load_toml("pyproject.toml")
@@ -63,7 +63,7 @@ raise SystemExit(failed > 0)
 
 
 def run_readme(session: nox.Session, module: str, *written: str, **env: str) -> None:
-    """Run README's line that installs what a module needs and runs it, word for word, and look for what it has written."""
+    """Run README's command line for a module, word for word, and check that it has written these files."""
     form = rf"python3 -m venv \.venv && .+ && \.venv/bin/python -m {module}\b.*"
     lines = [line for line in Path("README.md").read_text(encoding="utf-8").splitlines() if re.fullmatch(form, line)]
     if len(lines) != 1:
@@ -80,7 +80,7 @@ def install_group(session: nox.Session, *groups: str) -> None:
 
 
 def copy_tree(session: nox.Session) -> Path:
-    """Return a folder with a copy of the files in git's index, which are without libraries."""
+    """Return a folder with a copy of the files in git's index, which has no built libraries."""
     tree = Path(session.create_tmp()).resolve() / "tree"
     shutil.rmtree(tree, ignore_errors=True)
     session.run("git", "checkout-index", "--all", f"--prefix={tree}/", external=True)
@@ -88,7 +88,7 @@ def copy_tree(session: nox.Session) -> Path:
 
 
 def build_wheel(session: nox.Session, *options: str, folder: Path, **env: str | None) -> Path:
-    """Build a wheel into a folder, and return it."""
+    """Build a wheel in a folder, and return its path."""
     session.run("python", "-m", "pip", "wheel", "-q", "--no-deps", *options, "-w", str(folder), ".", env=env)
     return max(folder.glob("*.whl"), key=lambda path: path.stat().st_mtime)
 
@@ -155,7 +155,7 @@ def older_filterpy(session: nox.Session) -> None:
 
 @nox.session(default=False)
 def bare(session: nox.Session) -> None:
-    """Install without a C compiler, where pip fetches zig's, and without a network, where it says what to install."""
+    """Install without a C compiler: pip fetches zig's, or, without a network too, the message says what to install."""
     tree, without_compiler = str(copy_tree(session)), {"PATH": "", "CC": None}
     session.install("hatchling>=1.25")
     said = session.run(
@@ -197,7 +197,7 @@ def slow(session: nox.Session) -> None:
 
 @nox.session(default=False)
 def fuzz(session: nox.Session) -> None:
-    """Give the readers of files a minute of what atheris makes; skipped if there is no atheris for this Python."""
+    """Fuzz the readers of files with atheris for a minute; skipped if there is no atheris for this Python."""
     session.install(*PINNED, "-e", ".[test]")
     try:
         session.install("atheris>=3")

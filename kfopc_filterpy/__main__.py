@@ -1,4 +1,4 @@
-"""The command `kfopc`, which is also `python -m kfopc_filterpy`. Its modules are loaded where an interrupt is caught."""
+"""The command `kfopc`, also as `python -m kfopc_filterpy`. An interrupt is caught while its modules load, too."""
 
 import sys
 

@@ -231,7 +231,7 @@ def how_to_install(extra: str) -> str:
 
 
 def optional_module(name: str, extra: str, what: str) -> Any:
-    """Return a module that an extra brings; where it is missing, the message says that `what` needs it."""
+    """Return a module of an extra; if it is missing, the error says that `what` needs it, and how to install it."""
     try:
         return import_module(name)
     except ImportError as error:

@@ -209,7 +209,7 @@ def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = Non
         parser.error(str(error))
     entries: dict[str, Entry] = {**own_entries(), **peers(), **(objects or {}), **commands}
     runs, outcomes = Runs(), []
-    with one_blas_thread(), warnings.catch_warnings():  # the runs that are timed take one, too
+    with one_blas_thread(), warnings.catch_warnings():  # as in the runs that are timed
         warnings.simplefilter("ignore", RuntimeWarning)  # of filters that diverge while they are tuned
         for path in files:
             try:

@@ -194,7 +194,7 @@ def _made(make: Callable[..., Any], table: Mapping[str, Any], where: str, **own:
 
 
 def _of_model(models: Mapping[str, Callable[..., Any]], table: Mapping[str, Any], where: str, **own: Any) -> Any:
-    """Return what the model makes that a table names."""
+    """Return what the model that a table names makes of the rest of the table."""
     settings = dict(table)
     model = as_choice(settings.pop("model", None), f"{where}: model", models)
     return _made(models[model], settings, f"{where}, model {model}", **own)
@@ -260,5 +260,5 @@ def _require_same_signals(path: Path, expected: str, signals: list[np.ndarray]) 
     if digest.hexdigest() != expected:
         raise ValueError(
             f"{path.name} was made for other signals: their hash is {digest.hexdigest()}, not {expected}. If a model "
-            "was changed on purpose, write this hash into the file; scores from before cannot be compared then"
+            "was changed on purpose, write this hash into the file; earlier scores are then not comparable"
         )

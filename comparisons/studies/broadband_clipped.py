@@ -22,7 +22,7 @@ START_DB = 1.0  # that the first second may lack
 
 
 def run_clipped(runs: Runs, scene: Scene, clipped: Scene, tuned: Mapping[str, Tuned]) -> Results:
-    """Return the runs with the amplifier that clips, and those of KF-OPC with the q of the linear one.
+    """Return the runs with the amplifier that clips, and those of KF-OPC with the q of a linear amplifier.
 
     That q is right if the disturbance estimate knows the amplifier, e + s^ * amplifier(y).
     """
@@ -35,7 +35,7 @@ def run_clipped(runs: Runs, scene: Scene, clipped: Scene, tuned: Mapping[str, Tu
 
 
 def starts(results: Sequence[SimulationResult]) -> dict[str, list[float]]:
-    """Return figures of each seed of the start, which the steady half does not show."""
+    """Return each seed's figures of the start, which the steady half does not show."""
     return {
         "first_second_noise_reduction_db": [first_second_db(r) for r in results],
         "steady_noise_reduction_db": [noise_reduction_db(r.error, r.disturbance) for r in results],

@@ -123,20 +123,20 @@ def noises() -> dict[str, Noise]:
 
 @cache
 def measured_data(noise: str = "motor") -> MeasuredDuct | None:
-    """Return the measured duct and one of its recordings, or None if they cannot be had."""
+    """Return the measured duct and one of its recordings, or None if they are not available."""
     with suppress(signals.DataUnavailableError):
         return signals.load_measured_duct(noise=noise, allow_download=True)
     return None
 
 
 def recordings(*names: str) -> dict[str, np.ndarray]:
-    """Return those of some recordings that can be had, without their means."""
+    """Return those of some recordings that are available, with their means removed."""
     ducts = {name: measured_data(name) for name in names}
     return {name: duct.noise - duct.noise.mean() for name, duct in ducts.items() if duct is not None}
 
 
 def measured_room() -> MeasuredRoom | None:
-    """Return the measured room, or None if it cannot be had."""
+    """Return the measured room, or None if it is not available."""
     with suppress(signals.DataUnavailableError):
         return signals.load_measured_room(allow_download=True)
     return None
@@ -161,7 +161,7 @@ def make_case(
 def unit_scene(
     pair: Pair, noise: np.ndarray, *, n_taps: int, sensor_noise_db: float, seed: int, fs: float = FS
 ) -> Scene:
-    """Return the scene of one noise whose Wiener control power is 1, and so is the rated power."""
+    """Return the scene of one noise, with a Wiener control power of 1 and a rated power of 1."""
     return make_scene(
         {seed: noise},
         *pair,
@@ -231,7 +231,7 @@ def run_each(runs: Runs, scene: Scene, settings: Mapping[str, Setting], **record
 
 
 def run_seeds(runs: Runs, scene: Scene, tuned: Mapping[str, Tuned], planned: bool = True) -> Results:
-    """Return the runs of each algorithm at its best setting on each seed; None where a filter could not go on."""
+    """Return the runs of each algorithm at its best setting on each seed; None if a filter could not go on."""
     jobs = [(name, best.setting, k) for name, best in tuned.items() for k in range(len(scene.seeds))]
     outcomes = iter(run_settings(runs, scene, jobs, lambda result: result, planned))
     return {name: [next(outcomes) for _ in scene.seeds] for name in tuned}

@@ -1,4 +1,4 @@
-"""The constraint on an amplifier that clips, and behind a limiter: runs of the constraint study in which more is wrong."""
+"""Runs of the constraint study with an amplifier that clips, and behind a limiter with further faults."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def controller_of(scene: Scene, name: str, tuned: Settings, amplifier: Any = Non
 
 
 def run_amplifiers(scene: Scene, primary: np.ndarray, case: Case, tuned: Settings) -> list[ClippedRow]:
-    """Run with an amplifier that clips: known, unknown or known wrongly; behind a limiter, with more that is wrong."""
+    """Run with an amplifier that clips: known, unknown or known wrongly; behind a limiter, with a wrong path or a level jump."""
     limit = scene.amplitude_limit
     clipping = replace(scene, amplifier=HardClipAmplifier(limit))
     known = {

@@ -1,4 +1,4 @@
-"""Rows of the multichannel study, and what is asked of KF-PB in them."""
+"""Rows of the multichannel study, and its claims about KF-PB."""
 
 from __future__ import annotations
 

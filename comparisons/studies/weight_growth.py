@@ -1,4 +1,4 @@
-"""How the largest weight of a control filter goes on over a run: without bound, or not at all."""
+"""How the largest weight of a control filter grows over a run: without bound, or not at all."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ CONSTANT_TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class Growth:
-    """How the largest weight of a control filter went on; all of it but `diverged_at_s` are ratios."""
+    """How the largest weight of a control filter grew; all fields but `diverged_at_s` are ratios."""
 
     over_optimal: float  # at the end, over the largest weight of the Wiener solution
-    over_half: float  # at the end, over half of the run
-    of_quarters: float  # gained in the last quarter, over what was gained in the second: 1 on a straight line
+    over_half: float  # at the end, over that at half of the run
+    of_quarters: float  # growth in the last quarter, over that in the second: 1 on a straight line
     diverged_at_s: float | None = None
 
     @property
@@ -34,7 +34,7 @@ class Growth:
 
 
 def growth_of(result: SimulationResult, optimal_weight: float) -> Growth:
-    """Return how the largest weight of a run went on."""
+    """Return how the largest weight of a run grew."""
     assert result.weights is not None
     largest = np.abs(result.weights).max(axis=1)
     quarter, half, three, end = (float(largest[k * (largest.size - 1) // 4]) for k in (1, 2, 3, 4))

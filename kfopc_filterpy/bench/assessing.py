@@ -92,10 +92,11 @@ def assess(
     Parameters
     ----------
     noise : array_like, shape (n_samples,) or (I, n_samples)
-        Recording of the reference microphones, with silent loudspeakers; without any that of the error microphones, see
-        `feedback`. The rate of a `Recording` must be `fs`.
+        Recording of the reference microphones, with silent loudspeakers; if there are none, of the error microphones (see
+        `feedback`). The rate of a `Recording` must be `fs`.
     primary : array_like, shape (n_path,) or (K, I, n_path), or control.TransferFunction, optional
-        Impulse response from each reference to each error microphone. None if there is a `disturbance`, or no reference.
+        Impulse response from each reference to each error microphone. None with a `disturbance`, or without reference
+        microphones.
     secondary : array_like, shape (n_path,) or (K, J, n_path), or control.TransferFunction
         Impulse response from each control signal to each error microphone.
     rating : float, AmplifierRating, LoudspeakerRating, or a sequence of them
@@ -128,7 +129,7 @@ def assess(
     switch_on_s : float, optional
         Time in s at which the control is switched on; by default 0.5 s, or a tenth of a shorter record.
     feedback : bool, default False
-        Whether the controllers also predict the disturbance from its past, see `with_internal_model`: hybrid control. If
+        Whether the controllers also predict the disturbance from its past (hybrid control, see `with_internal_model`). If
         neither `primary` nor `disturbance` is given, there is no reference microphone, as in headphones, and `noise` is
         the disturbance.
     bar : tqdm bar, optional
@@ -163,9 +164,9 @@ def assess(
     If a loudspeaker's rating has an excursion, the rated power is the largest at which the best fixed filter's control
     signal keeps it.
 
-    With `feedback`, the disturbance one sample late is a reference, also of the ceilings: they are those of predictors, and
-    the coherence is none. The settled loop is judged by `paths.internal_model_margin`, with the least margin of `secondary`
-    and of the paths that `secondary_path_uncertainty` may hold.
+    With `feedback`, the disturbance one sample late is a reference, for the ceilings too: they are those of predictors, and
+    there is no coherence. `paths.internal_model_margin` judges the settled loop with `secondary` and with any measured paths
+    in `secondary_path_uncertainty`; the least margin counts.
 
     With several loudspeakers the required rated powers are in the proportions of the ratings. The coherence is the multiple
     coherence of all references. The causality margin is that of each microphone's earliest loudspeaker, at the worst
@@ -324,7 +325,7 @@ def recorded_signals(
     """Return references, disturbances and secondary paths, checked, the recordings without their offsets.
 
     With `feedback`, the disturbances one sample late are the last references, or the only ones if neither `primary` nor
-    `disturbance` is given: `noise` is then the disturbance. One channel of everything comes without channel axes.
+    `disturbance` is given: `noise` is then the disturbance. With one channel of each kind, there are no channel axes.
     """
     x = _recording(noise, "noise", fs)
     s, _ = secondary_paths(secondary, fs=fs, name="secondary")

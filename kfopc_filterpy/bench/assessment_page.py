@@ -105,7 +105,7 @@ def run_figures(
     together: str = "",
     pascal_per_unit: Any = None,
 ) -> Iterator[FigureItem]:
-    """Yield the spectra of the errors and their power over time, captions with `together`, and each loudspeaker's power."""
+    """Yield figures of the error spectra, the error power (caption with `together`) and each loudspeaker's power."""
     begin = SWITCHED_ON.format(switch_on_s)
     ax: Any = plot_error_spectra(runs, pascal_per_unit=pascal_per_unit)
     caption = f"Spectra without control and of the errors, over the steady half.{together}"
@@ -125,7 +125,7 @@ def run_figures(
 
 
 def _one_below_another(count: int, what: str, size: tuple[float, float], draw: Callable[[int, Any], None]) -> Figure:
-    """Return a figure of axes below each other, each drawn; the labels of several begin with what they show, numbered."""
+    """Return a figure of axes drawn one below another; if there are several, each label begins with `what` and a number."""
     import matplotlib.pyplot as plt
 
     height = size[1] * (1.0 if count == 1 else 0.8 * count)
@@ -196,7 +196,7 @@ def _nominal(centre: float) -> str:
 
 
 def run_sounds(runs: Mapping[str, SimulationResult], own: str = "") -> Iterator[Sound]:
-    """Yield the sounds without control and of each run, from the steady half on, at each microphone; `own` is "after"."""
+    """Yield the sounds at each microphone, without control and of each run; the file of the run `own` is called "after"."""
     first = next(iter(runs.values()))
     settled = 0.5 * first.n_samples / first.fs
     for k, disturbance in enumerate(np.atleast_2d(first.disturbance)):

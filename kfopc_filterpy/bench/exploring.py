@@ -38,7 +38,7 @@ class AcousticSetup:
     primary, secondary : array_like, shape (n_taps,)
         Taps of the primary path and of the secondary path, see `paths.read_path`.
     fs : float
-        Sampling frequency in Hz; that of recordings must be the same.
+        Sampling frequency in Hz, also that of recordings.
     noise : array_like, shape (n_samples,), optional
         Recording of the reference microphone, of which the first 3.5 s are used; at least 1 s. By default Gaussian noise.
 

@@ -188,7 +188,7 @@ def _two_gradients(scene: Scene, mu: float, share: float) -> dict[str, Any]:
 
 
 def _in_blocks(scene: Scene, mu: float, _: float) -> dict[str, Any]:
-    """Take one partition, for fine bins, and four blocks in it; shorter ones than 16 samples would cost mere calls."""
+    """Return one partition, for fine bins, of four blocks; in blocks of less than 16 samples, calls would take most time."""
     block = max(-(-scene.n_taps // 4), 16)
     return {"step_size": mu, "block_size": block, "partition_size": 4 * block}
 

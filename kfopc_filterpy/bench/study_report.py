@@ -342,9 +342,9 @@ def file_of(folder: Path, study: StudyReport, item: FigureItem | Sound | Table) 
 
 
 def loudness(signals: Iterable[np.ndarray]) -> tuple[list[np.ndarray], float]:
-    """Return signals, clipped if they must be, and the one peak that is full scale for all of them.
+    """Return the signals, clipped at full scale, and full scale, which is one peak for all of them.
 
-    Full scale is the loudest one's peak, at most 4 times the first's: a run that diverges would silence the rest.
+    It is the peak of the loudest, but at most 4 times that of the first: a run that diverges would silence the rest.
     """
     signals = [np.asarray(signal, dtype=np.float64) for signal in signals]
     peaks = [float(np.max(np.abs(signal), initial=0.0, where=~np.isnan(signal))) for signal in signals]

@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 done or enough, 1 not enough or stopped by a fault, 2 wrong input, 141 nobody reads.
+        0 done or enough, 1 not enough or stopped by a fault, 2 wrong input, 141 nobody reads the output.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     options, unknown = whole_parser().parse_known_args(

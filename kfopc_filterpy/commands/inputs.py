@@ -142,7 +142,7 @@ class Files:
         return read
 
     def _chosen(self, path: str, source: str, is_path: bool, fs: float | None) -> Recording:
-        """Return the channels of a file that its argument or else the options choose, at a rate."""
+        """Return the channels of a file, chosen by its argument or else by the options, at a rate."""
         from ..paths.reading import path_of
         from ..signals.recordings import LEAST_SURE_RATE, as_channel, read_content, recording_of
 

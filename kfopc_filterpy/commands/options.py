@@ -65,7 +65,7 @@ def _checked(kind: Callable[[str], Any], option: str, check: Callable[..., Any],
 
 
 def refuse_unused(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
-    """Raise ValueError, with the reason why, if one of the options that nothing would use is given."""
+    """Raise ValueError, with the reason `why`, if one of these options is given: nothing would use it."""
     unused = [f"--{name.replace('_', '-')}" for name in names if getattr(options, name) is not None]
     if unused:
         raise ValueError(f"{' and '.join(unused)} would not be used{why}")

@@ -40,7 +40,7 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     parser.add_argument("noise", nargs="?", help="recording of the reference microphone, for a simulated plant")
     add_scene(parser, required=False)
     about = (
-        "predict the disturbance from its past, too (hybrid control). Without --references, or for a recording without "
+        "also predict the disturbance from its past (hybrid control). Without --references, or for a recording without "
         "--primary and --disturbance, there is no reference microphone: the recording is that of the error microphone"
     )
     parser.add_argument("--feedback", action="store_true", help=about)
@@ -157,7 +157,7 @@ def _judge_length(options: argparse.Namespace, lasts: float) -> None:
 
 
 def _controller(plant: Any, options: argparse.Namespace, limit: float) -> Any:
-    """Return KF-PB behind a limiter, for the plant that was identified; with feedback around an internal model."""
+    """Return KF-PB behind a limiter for the identified plant; with `--feedback` it has an internal model."""
     from .. import OutputLimiter, kf_pb
     from ..controllers import with_internal_model
 

@@ -38,7 +38,7 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     parser = add_command(commands, "verdict", verdict, "say whether an amplifier is enough, and what limits", EXAMPLES)
     add_recorded_scene(parser)
     about = (
-        "predict the disturbance from its past, too (hybrid control). Without --primary and --disturbance there is no "
+        "also predict the disturbance from its past (hybrid control). Without --primary and --disturbance there is no "
         "reference microphone, as in headphones: the noise is what the error microphone records without control"
     )
     parser.add_argument("--feedback", action="store_true", help=about)

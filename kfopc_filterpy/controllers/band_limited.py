@@ -33,7 +33,7 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
 
     .. math:: \lambda_b \leftarrow \max\Big\{\lambda_b + \frac{\mu}{16}\, G_b \Big(\frac{p_b}{\rho_b} - 1\Big),\ 0\Big\}
 
-    It settles where :math:`E[e^2] + \sum_b \lambda_b (p_b - \rho_b)` is stationary, so each band keeps its limit with
+    The algorithm settles where :math:`E[e^2] + \sum_b \lambda_b (p_b - \rho_b)` is stationary, so each band keeps its limit with
     the least error. With one band, from 0 to fs/2, this is the power-constrained Wiener solution.
 
     Parameters
@@ -78,8 +78,8 @@ class BandLimitedFxLMS(FrequencyDomainFxLMS):
 
     Examples
     --------
-    White noise whose cancellation takes a power of 0.5 in each half of the spectrum; the upper half may have half of
-    that:
+    The cancellation of this white noise takes a power of 0.5 in each half of the spectrum; the limit of the upper half
+    is half of that:
 
     >>> import numpy as np
     >>> from kfopc_filterpy import BandLimitedFxLMS, simulate

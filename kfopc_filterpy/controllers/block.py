@@ -113,7 +113,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         return rfft(self._newest(irfft(x * self._S, self._window)))
 
     def _least_power(self) -> float:
-        """Return a power far below that of the filtered references: a path that is silent as yet leaves rounding errors."""
+        """Return a power far below that of the filtered references, but above that of their rounding errors."""
         return ROUNDING * float(np.sum(self._path**2) * np.mean(self._newest(self._references) ** 2)) + TINY
 
     def _newest(self, signal: np.ndarray) -> np.ndarray:
@@ -184,7 +184,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
     def emit(self, x: np.ndarray, limit: np.ndarray | None = None) -> np.ndarray:
         """Return the control signals (J, n) for references x (I, n) of at most `samples_left` samples.
 
-        They end before the first sample that is not within a `limit` (J, 1), unless this is their first one.
+        They end before the first sample that is not within a `limit` (J, 1), but have at least one sample.
         """
         require_moderate(x, "reference")
         if self._n == self.block_size:  # the error of its last sample was not taken
@@ -204,7 +204,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         return y
 
     def take(self, errors: np.ndarray, taken: ArrayLike = True) -> None:
-        """Take the errors (K, n) that the last n control signals left; `taken` says to which of them to adapt, (n,)."""
+        """Take the errors (K, n) that the last n control signals left; `taken`, (n,), says which of them to adapt to."""
         require_moderate(errors, "error", LOUDEST_ERROR)
         here = slice(self._n - errors.shape[1], self._n)
         self._taken[here] = taken

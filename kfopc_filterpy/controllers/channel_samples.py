@@ -51,7 +51,7 @@ def amplified(amplifiers: list[Any] | None, y: np.ndarray) -> np.ndarray:
 
 
 def through(paths: np.ndarray, lines: np.ndarray) -> np.ndarray:
-    """Return what paths (outputs, inputs, taps) make of signals (inputs, taps - 1 + n), without their start: (outputs, n)."""
+    """Return signals (inputs, taps - 1 + n) filtered by paths (outputs, inputs, taps), without the start: (outputs, n)."""
     rows = np.lib.stride_tricks.sliding_window_view(lines, paths.shape[2], axis=1)[..., ::-1]
     return np.tensordot(paths, rows, axes=((1, 2), (0, 2)))
 

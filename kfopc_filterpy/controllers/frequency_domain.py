@@ -43,7 +43,7 @@ class FrequencyDomainFxLMS(BlockController):
         Samples B of a block. The weights follow a change no sooner than at the end of a block.
     partition_size : int, optional
         Taps N of a partition, a multiple of B; by default B. With at least `n_taps`, there is one partition. The result
-        of the block LMS does not depend on it.
+        of the block LMS does not depend on this size.
     constrained : bool, default True
         False leaves out C except in the first partition, where the delayless control signal needs it. This saves most
         of the transforms. But each partition then also has taps that repeat those of its neighbours (`weights` leaves
@@ -61,8 +61,8 @@ class FrequencyDomainFxLMS(BlockController):
     ------
     ValueError
         A step size that is not positive and finite; sizes below 1; a partition size that is not a multiple of the block
-        size; without the constraint, `n_taps` that is not a multiple of the partition size; a path that is not FIR or
-        all zeros.
+        size; without the constraint, `n_taps` that is not a multiple of the partition size; a path that is all zeros
+        or not FIR.
 
     Notes
     -----

@@ -60,7 +60,7 @@ class FrequencyDomainKalman(FrequencyDomainFxLMS):
     ----------
     G. Enzner, P. Vary, "Frequency-domain adaptive Kalman filter for acoustic echo control in hands-free telephones",
     Signal Processing 86(6), 2006. F. Kuech, E. Mabande, G. Enzner, "State-space architecture of the
-    partitioned-block-based acoustic echo controller", ICASSP 2014. Both apply the gain at once; for its factors M, see
+    partitioned-block-based acoustic echo controller", ICASSP 2014. Both apply the gain in one step; for its factors M, see
     `FrequencyDomainFxLMS`.
 
     Examples
@@ -107,7 +107,7 @@ class FrequencyDomainKalman(FrequencyDomainFxLMS):
         anti_noise = irfft(rfft(self._emitted) * self._S[0, 0], self._window)[:, -self.block_size :]
         error = self._errors + anti_noise - self._block_of(np.sum(W * X, axis=0))
         E = self._block_spectrum(np.where(self._taken, error, 0.0))
-        if not E.any():  # the sound is still under way: a noise of zero would make P zero for good
+        if not E.any():  # no sound has arrived yet: a noise of zero would make P zero for good
             return
         self._noise = self._averaged(self._noise, np.abs(E[0]) ** 2)
         P *= self.transition**2

@@ -340,7 +340,7 @@ def suggested_constraint(
 
 
 def rate_of(n_taps: int | SuggestedSettings, fs: float | None) -> float:
-    """Return a sample rate in Hz, by default that of suggested settings if `n_taps` are such."""
+    """Return a sample rate in Hz: `fs`, or else that of suggested settings given as `n_taps`, or else the default."""
     if fs is None:
         return n_taps.fs if isinstance(n_taps, SuggestedSettings) else DEFAULT_FS
     return fs

@@ -120,7 +120,7 @@ def process_steps(
 def checked_block(
     controller: Any, references: Any, errors: Any, adapt: Any, out: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any]:
-    """Return references, errors, whether to adapt to each sample, and room for the control signals, if its shape is known."""
+    """Return references, errors, whether to adapt to each sample, and the array for the control signals, if known."""
     x, e = block_signals(controller, references, errors)
     flags = adapt_flags(adapt, x.shape[-1])
     require_apart(out, x, e)
@@ -145,7 +145,7 @@ def block_signals(controller: Any, references: Any, errors: Any) -> tuple[np.nda
 
 
 def states_channels(controller: object) -> bool:
-    """Return whether a controller states its channels. Those of a user's, and of virtual microphones, show in a sample."""
+    """Return whether a controller states its channels; for virtual microphones and a user's controller, a sample shows them."""
     return hasattr(controller, "multichannel") and not hasattr(controller, "physical")
 
 

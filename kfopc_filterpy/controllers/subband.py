@@ -41,7 +41,7 @@ class SubbandFxLMS(BlockController):
     ------
     ValueError
         A step size that is not positive and finite; sizes below 1; an odd number of bands; `n_taps` or `block_size`
-        that is not the multiple stated above; a path that is not FIR.
+        that is not the multiple stated above; a path that is all zeros or not FIR.
 
     Notes
     -----
@@ -54,7 +54,7 @@ class SubbandFxLMS(BlockController):
     References
     ----------
     D. R. Morgan, J. C. Thi, "A delayless subband adaptive filter architecture", IEEE Trans. Signal Processing 43(8),
-    1995: the structure, and the stacking of the spectra; there the bin at fs/2 is zero; here it is kept, because a
+    1995: the structure, and the stacking of the spectra. There, the bin at fs/2 is zero; here it is kept, because a
     short filter needs it. S. J. Park, J. H. Yun, Y. C. Park, D. H. Youn, "A delayless subband active noise control
     system for wideband noise control", IEEE Trans. Speech and Audio Processing 9(8), 2001, models the secondary path in
     the bands; here the reference is filtered in the full band, by Fourier transforms.

@@ -175,7 +175,7 @@ class SubfilterKalman(BlockProcessing, Checkpointed):
         self.kf = KFOPC.random_walk(
             len(bank),
             state_noise=state_noise,
-            measurement_noise=as_positive(measurement_noise, "measurement_noise"),  # a silent bank tells nothing
+            measurement_noise=as_positive(measurement_noise, "measurement_noise"),  # S must not be 0 in silence
             initial_variance=initial_variance,
         )
         self.subfilters = bank

@@ -213,8 +213,8 @@ class VirtualMicrophones(WrappedController):
     ----------
     controller : Controller
         Controller for the virtual microphones: it takes errors (K_v,), and its secondary paths are those to the virtual
-        microphones. With an internal model, its reference is :math:`\hat d_v(n - 1)`: the headrest without a
-        reference microphone. A controller of your own works too.
+        microphones. With an internal model, its reference is :math:`\hat d_v(n - 1)`, for a headrest without
+        a reference microphone. A controller of your own works too.
     secondary_path : array_like, shape (K, J, taps), or nested sequence of control systems
         Estimated secondary paths to all microphones of the plant, physical and virtual.
     observer : ObservationFilters, array_like of shape (K_v, K_p, n_taps), KalmanObserver, or an object like it

@@ -66,8 +66,8 @@ def simulate(
     """Run a controller in the modified ANC structure.
 
     For each sample, compute the control signal from the last weights, the amplifier's output and the error
-    e = d - s*y_amp, then update the controller. Built-in controllers run at compiled speed; a user-defined controller is
-    called sample by sample.
+    e = d - s*y_amp, then update the controller. Built-in controllers run at compiled speed, or block by block if they
+    adapt once per block; a user-defined controller is called sample by sample.
 
     With several channels, the channel is the leading axis: I references, J loudspeakers, K error microphones. A
     user-defined controller then gets and returns arrays: ``control_signal(reference)``, (I,), returns (J,), and
@@ -125,7 +125,7 @@ def simulate(
     progress : callable, optional
         Called with the number of samples done since its last call, such as `tqdm.update`.
     compiled : bool, default True
-        False: call the controller sample by sample even if it has a compiled loop; the results are equal.
+        False: call the controller sample by sample even if it has a faster way; the results are equal.
 
     Returns
     -------
@@ -312,7 +312,7 @@ class _Run:
         return False, x.shape[1]
 
     def blocks(self, x: np.ndarray) -> tuple[bool, int]:
-        """Run a controller that keeps its control filter for a block, as `steps` does, by stretches within its blocks."""
+        """Do what `steps` does for a controller that keeps its control filter for a block, in stretches within its blocks."""
         begin, changes, n_samples, limit = 0, 0, x.shape[1], self.plant.limit[:, None]
         while begin < n_samples:
             if begin == changes:

@@ -45,17 +45,18 @@ class FeedbackMargin:
     path_error_hz : float
         Frequency in Hz at which the tolerated error is smallest.
     paths : tuple of ndarray
-        Control filter (J, K, taps), path (K, J, taps) and estimate of the path, between which the loop is closed.
+        Control filter (J, K, taps), path (K, J, taps) and estimate of the path, which form the loop.
     fs : float
         Sampling rate in Hz.
 
     Notes
     -----
-    With several channels, delta is a matrix that multiplies the path from either side: errors of the microphones, or of the
-    loudspeakers. ``|delta|`` is its largest singular value, and ``|T|`` the larger one of those of T, with the loop
-    opened at the microphones or at the loudspeakers. So all channels may be wrong at once, in any way. The disk margin
-    holds for factors of all microphones, or of all loudspeakers, that differ. It is at most that of
-    `control.disk_margins`, which uses the structured singular value, and needs slycot for several channels.
+    With several channels, delta is a matrix that multiplies the path from the left, for errors of the microphones, or from
+    the right, for errors of the loudspeakers. ``|delta|`` is its largest singular value. ``|T|`` is the larger of the
+    largest singular values of T with the loop opened at the microphones and at the loudspeakers. So all channels may be
+    wrong at once, in any way. The disk margin allows a different factor for each microphone, or for each loudspeaker. It
+    is at most that of `control.disk_margins`, which uses the structured singular value and needs slycot for several
+    channels.
     """
 
     stable: bool
@@ -81,7 +82,7 @@ class FeedbackMargin:
     def loop(self) -> control.TransferFunction:
         """Loop transfer function of one channel, in python-control's convention: ``1 / (1 + loop)`` is the sensitivity.
 
-        ``-w (f - f^)`` for acoustic feedback. With several channels it raises ValueError.
+        For acoustic feedback it is ``-w (f - f^)``. With several channels, it raises ValueError.
         """
         from control import TransferFunction
 
@@ -146,8 +147,8 @@ def feedback_margin(
 
     Notes
     -----
-    The loop has a finite impulse response, so by Nyquist's criterion it is stable if ``1 - W (F - F^)``, with several
-    channels the determinant of ``I - (F - F^) W``, does not encircle the origin. The margins are those at the worst
+    The loop has a finite impulse response, so by Nyquist's criterion it is stable if ``1 - W (F - F^)`` does not encircle
+    the origin; with several channels, this is the determinant of ``I - (F - F^) W``. The margins are those at the worst
     frequency of a grid with a spacing of fs/65536 or less. The adaptation changes w, so the margin holds for this
     control filter only.
 
@@ -204,8 +205,8 @@ def internal_model_margin(
     Parameters
     ----------
     control_filter : array_like, shape (n_taps,) or (J, K, n_taps)
-        Settled control filter w: `control_filter` of a feedback controller. Of a hybrid controller's, (J, I + K, n_taps), the
-        last K are used, those for the disturbances.
+        Settled control filter w: `control_filter` of a feedback controller. That of a hybrid controller has the shape
+        (J, I + K, n_taps); its last K inputs, the disturbances, are used.
     secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control.TransferFunction
         True path s from the loudspeaker to the error microphone.
     secondary_estimate : array_like or control.TransferFunction, optional
@@ -240,8 +241,7 @@ def internal_model_margin(
     >>> internal_model_margin([0.5], [0.0, 3.1], [0.0, 1.0], fs=8000.0).stable
     False
 
-    Two such loops, with loudspeakers that are both heard at both microphones: the gain doubles where the disturbances are
-    equal.
+    Two such loops, with both loudspeakers heard at both microphones: the gain doubles if the disturbances are equal.
 
     >>> import numpy as np
     >>> filters, path = np.zeros((2, 2, 2, 2))

@@ -1,4 +1,4 @@
-"""Checks of recordings and impulse responses, which messages call by their files or arguments."""
+"""Checks of recordings and impulse responses, with messages that name the files or arguments."""
 
 from __future__ import annotations
 

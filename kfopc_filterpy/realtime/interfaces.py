@@ -80,7 +80,7 @@ class SimulatedInterface:
     Parameters
     ----------
     reference : array_like, shape (n_samples,) or (I, n_samples), or None
-        Reference x, the noise; None without a reference microphone, then give a `disturbance`.
+        Reference x, the noise. Without a reference microphone, None: then give a `disturbance`.
     secondary_path : array_like or control.TransferFunction
         True secondary path s, or paths (K, J, n_taps), without the delay of the interface.
     primary_path : array_like or control.TransferFunction, optional

@@ -155,8 +155,8 @@ class IdentifiedPlant:
     round_trip_samples : int
         Samples from a control signal to its first arrival at an error microphone.
     references, errors : ndarray, shape (n_samples,), or (I, n_samples) and (K, n_samples)
-        Microphones during the silence before; with one channel, without a channel axis. Without a reference microphone,
-        `references` is (0, n_samples).
+        Microphone signals of the silence before; with one channel, without a channel axis. Without a reference
+        microphone, `references` is (0, n_samples).
     fs : float
         Sample rate in Hz.
     """
@@ -178,9 +178,9 @@ class IdentifiedPlant:
         return np.asarray(self.path.uncertainty)
 
     def suggested(self, n_taps: int | None = None) -> SuggestedSettings:
-        """Return `suggest_settings` for the noise heard in the silence, for `n_taps` taps or a length found; one channel.
+        """Return `suggest_settings` for the noise heard in the silence, with `n_taps` taps or a length that it finds.
 
-        Without a reference microphone, they are those of a feedback controller.
+        For one channel only. Without a reference microphone, the settings are those of a feedback controller.
         """
         x = self.references if self.references.size else predictor_reference(self.errors)
         return suggest_settings(x, self.errors, self.taps, fs=self.fs, n_taps=n_taps)
@@ -660,9 +660,9 @@ def _identified(
 
 
 def _fitted(sent: np.ndarray, heard: np.ndarray, n_taps: int, fs: float) -> PathEstimate:
-    """Return the path by least squares, weighted by the spectrum of what a first fit has not explained.
+    """Return the path by least squares, with a filter that makes what a first fit has not explained white.
 
-    That is the noise that no reference microphone hears. A loud tone, for example, then costs accuracy only at its frequency.
+    This is noise that no reference microphone hears. A loud tone, for example, then costs accuracy only at its frequency.
     """
     from scipy.linalg import solve_toeplitz
     from scipy.signal import fftconvolve, lfilter
@@ -676,7 +676,7 @@ def _fitted(sent: np.ndarray, heard: np.ndarray, n_taps: int, fs: float) -> Path
     correlation = np.fft.irfft(powers.mean(axis=(0, 1)))[: NOISE_TAPS + 1]
     if not correlation[0] > 0.0:
         return first
-    correlation[0] *= 1.0 + 1e-6  # of a pure tone, it would be singular
+    correlation[0] *= 1.0 + 1e-6  # a pure tone would make the system singular
     whitening = np.append(1.0, -solve_toeplitz(correlation[:-1], correlation[1:]))
     return estimate_path(lfilter(whitening, 1.0, sent), lfilter(whitening, 1.0, heard), n_taps, fs)
 

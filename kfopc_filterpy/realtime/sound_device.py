@@ -22,7 +22,7 @@ class SoundDevice:
     Parameters
     ----------
     reference_channels, error_channels : sequence of int
-        Inputs of the reference and the error microphones, the first input is 0. Without a reference microphone ``[]``.
+        Inputs of the reference and error microphones, counted from 0; ``[]`` stands for no reference microphone.
     output_channels : sequence of int, default (0,)
         Outputs of the loudspeakers. The other outputs up to the largest of them stay silent.
     fs : float, default 16000

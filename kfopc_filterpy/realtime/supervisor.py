@@ -48,9 +48,9 @@ class Supervisor(Checkpointed):
     path remember it. The controller therefore adapts again `recovery_samples` after the last bad reference. After a bad
     error, it adapts to the next sample, unless an internal model makes a reference of the error.
 
-    An internal model needs to know what was really played. So a controller with one gets the errors that it would hear if
-    its own control signals were played as they are, without fades and limits. In place of an error that is missing, it
-    gets the one that it would hear without noise.
+    An internal model relies on the control signals being played as they are. So a controller with an internal model gets
+    the errors that it would hear without fades and limits. In place of a missing error, it gets the one that it would
+    hear without noise.
 
     Parameters
     ----------
@@ -275,8 +275,8 @@ class Supervisor(Checkpointed):
         Parameters
         ----------
         references : array_like, shape (n_samples,) or (I, n_samples), or None
-            References x; None, and any value that is None, NaN or infinite, is a missing sample. Always None for a
-            controller without a reference microphone.
+            References x. A value that is None, NaN or infinite is a missing sample; None in place of the array means
+            that all are missing. A controller without a reference microphone takes None only.
         errors : array_like, shape (n_samples,) or (K, n_samples), or None
             Errors e, of as many samples; None as for the references, but not for both.
         lost : int, default 0
@@ -333,7 +333,7 @@ class Supervisor(Checkpointed):
         )
 
     def _usable(self, x: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return which errors are missing, (K, n), and which samples can be learned from, (n,); bad ones are noted."""
+        """Return which errors are missing, (K, n), and which samples can be learned from, (n,); note the bad ones."""
         block = np.concatenate((x, e))
         repeated = self.blocks_can_repeat and is_repeated(block, self._last_block)
         self._last_block = block
@@ -353,7 +353,7 @@ class Supervisor(Checkpointed):
     def _as_wanted(self, e: np.ndarray, missing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the errors (K, n) if all that the controller wanted had been played, and the disturbances.
 
-        The sound of this block is not in it yet: an estimated path begins with at least a block of zeros. Where an
+        The sound of this block does not count yet: an estimated path begins with at least a block of zeros. Where an
         error is missing, the disturbance is zero.
         """
         path = np.reshape(self.controller.secondary_path, (self.n_microphones, self.n_loudspeakers, -1))

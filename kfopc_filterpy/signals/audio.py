@@ -104,7 +104,7 @@ def _claimed_ends(file: BinaryIO, order: str, chunks: Mapping[bytes, Sequence[in
         end = max(end, 8 + wide)
     start, size = chunks.get(b"data") or chunks.get(b"SSND") or (0, 0)
     if size in _SIZES_UNKNOWN:
-        if wide_data is None:  # the size of the whole is then none either
+        if wide_data is None:  # then the size of the whole is unknown, too
             return 0, 0
         size = wide_data
     return start + size, max(end, start + size)

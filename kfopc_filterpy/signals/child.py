@@ -1,8 +1,8 @@
 """Reads a file in a process of its own, whose time and memory are limited, because a damaged file can hang a library.
 
 If a few bytes of a file are changed, libhdf5 can loop for ever, and scipy's reader of MATLAB files can end the process;
-both can take gigabytes. Nothing within the process can stop that. Another one costs 0.3 s. Its memory can be limited on
-Linux only.
+both can take gigabytes. Nothing within the process can stop that. A process of its own costs 0.3 s for each file. Its
+memory can be limited on Linux only.
 """
 
 from __future__ import annotations
@@ -68,14 +68,14 @@ def serve(library: str, function: tuple[str, str], arguments: list[str], limit_s
     try:
         read = getattr(import_module(module), name)
         import_module(library)  # which takes time and memory of its own
-        faulthandler.dump_traceback_later(limit_s, exit=True)  # also if a library never returns
+        faulthandler.dump_traceback_later(limit_s, exit=True)  # even if a library never returns
         _limit_memory(3 * room_of(arguments[0]))
         content: Content = read(*arguments)
         samples = np.ascontiguousarray(content.samples, dtype=np.float64)
         answer: dict[str, Any] = content._asdict() | {"shape": samples.shape}
         del answer["samples"]
     except MemoryError:
-        text = "would take more memory than a file of its size may. If it is right, store it uncompressed, or in parts"
+        text = "would take more memory than a file of its size may. If the file is right, store it uncompressed, or in parts"
         samples, answer = np.empty(0), {"error": f"{arguments[0]} {text}"}
     except Exception as error:  # noqa: BLE001 - whatever it is, the parent raises it
         samples, answer = np.empty(0), {"error": str(error) or type(error).__name__}

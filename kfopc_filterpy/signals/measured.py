@@ -220,7 +220,7 @@ def load_measured_room(
 def _vectors(
     name: str, folder: str | os.PathLike[str] | None, allow_download: bool, timeout_s: float
 ) -> dict[str, np.ndarray]:
-    """Return the vectors of a dataset, by variable. Its files are the published ones, so no process is needed."""
+    """Return the vectors of a dataset, by variable. Their hashes are checked, so the files are read in this process."""
     from scipy.io import loadmat
 
     timeout = as_positive(timeout_s, "timeout_s", unit="s")

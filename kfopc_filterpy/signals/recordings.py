@@ -44,7 +44,7 @@ class _Format(NamedTuple):
     name: str
     read: Callable[..., Content]
     suffixes: tuple[str, ...]
-    beginnings: tuple[bytes, ...] = ()  # by which a file is known whose suffix says nothing
+    beginnings: tuple[bytes, ...] = ()  # first bytes, by which a file without a known suffix is recognised
     has_variables: bool = False
 
 
@@ -372,7 +372,7 @@ def as_channel(channel: int, samples: np.ndarray, name: object, *, called: str =
 
 
 def _format_of(path: str | os.PathLike[str]) -> _Format:
-    """Return the format of a file whose suffix says nothing, by how it begins."""
+    """Return the format of a file without a known suffix, by its first bytes."""
     with open(path, "rb") as file:
         head = file.read(600)
     for kind in _FORMATS:
