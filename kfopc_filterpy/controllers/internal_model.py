@@ -33,7 +33,7 @@ def with_internal_model(controller: _Made) -> _Made:
     Parameters
     ----------
     controller : CoreController
-        Any controller of the package, made with ``n_references=K`` for K error microphones, or ``n_references=I + K`` for
+        Any controller whose steps are in the core, made with ``n_references=K`` for K error microphones, or ``n_references=I + K`` for
         hybrid control with I reference microphones. An algorithm of your own in C works too. It is not changed.
 
     Returns
@@ -45,7 +45,8 @@ def with_internal_model(controller: _Made) -> _Made:
     Raises
     ------
     TypeError
-        An object that is not a `CoreController`: a wrapper (wrap the result instead), or a controller in plain Python.
+        An object that is not a `CoreController`: a wrapper (wrap the result instead), or a controller that adapts once per
+        block or is in plain Python.
     ValueError
         A controller with fewer references than error microphones, or one that already has an internal model.
 
