@@ -44,8 +44,10 @@ def read_in_child(
         "search": sys.path,
     }
     command = [sys.executable, "-c", _RUN, json.dumps(job)]
+    # glibc would reserve 64 MB for the thread of the time limit, at times after the memory limit is set.
+    environment = os.environ | {"MALLOC_ARENA_MAX": "1"}
     with subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment
     ) as child:
         try:
             output: Any = child.stdout
