@@ -385,6 +385,8 @@ TABLED = (
     "two-gradient FxLMS",
     "re-scaling FxLMS",
     "clipping FxLMS",
+    "power-limited FxLMS",
+    "band-limited FxLMS",
 )
 TABLED_DB = -6.0
 
