@@ -155,12 +155,7 @@ class Supervisor(Checkpointed):
         blocks_can_repeat: bool = True,
     ) -> None:
         self._controller: Any = checked_controller(controller)
-        self._modelled = bool(getattr(controller, "internal_model", False))
-        if self._modelled and hasattr(controller, "physical"):
-            raise ValueError(
-                "controller must not have virtual microphones and an internal model: its paths are not those to the error "
-                "microphones; let it run by its own process, without a supervisor"
-            )
+        remembered = _modelled_samples(controller)
         self.fs = as_positive(fs, "fs", unit="Hz")
         if hasattr(controller, "require_sample_rate"):
             controller.require_sample_rate(self.fs)
@@ -181,7 +176,6 @@ class Supervisor(Checkpointed):
         ]
         self.health = Health()
         self._fresh = deepcopy(controller)
-        self._good = self._fresh if on_divergence == "freeze" else None  # state of the last good window
         self._fade = as_sample_count(fade_s, fs, "fade_s")
         self._mute_after = as_sample_count(mute_after_s, fs, "mute_after_s")
         self._window = as_sample_count(window_s, fs, "window_s")
@@ -201,34 +195,51 @@ class Supervisor(Checkpointed):
         self._last_block: Any = None
         # The last samples that the controller wanted to play, and those that were played, as far as an internal model
         # remembers them.
-        remembered = np.shape(self._controller.secondary_path)[-1] - 1 if self._modelled else 0
         self._wanted_y, self._played_y = np.zeros((2, self.n_loudspeakers, remembered))
+        # State of the last good window, and what it wanted to play.
+        self._good: Any = (self._fresh, self._wanted_y) if on_divergence == "freeze" else None
         self._usual, self._usual_reference, self._normal_gain = np.nan, np.nan, np.inf
         self._windows, self._loud_windows = 0, 0
         self._begin_window()
 
     @property
     def controller(self) -> Any:
-        """Controller that is running now. What was played so far counts for the limiter of one that is assigned."""
+        """Controller that is running now.
+
+        What was played so far counts for the limiter of one that is assigned. One with an internal model must not have
+        played anything yet.
+        """
         return self._controller
 
     @controller.setter
     def controller(self, controller: Controller) -> None:
         controller = checked_controller(controller)
+        remembered = _modelled_samples(controller)
         for new, old in zip(_limiters(controller), _limiters(self._controller), strict=False):
             if new is not old:
                 new.follow(old)
         self._controller = controller
+        self._wanted_y = np.zeros((self.n_loudspeakers, remembered))  # it has played nothing as yet
+        self._played_y = np.pad(self._played_y, ((0, 0), (remembered, 0)))[:, self._played_y.shape[1] :]
 
-    def _replace(self, state: Any) -> None:
-        """Go on with a copy of a controller, and with the limiter in use: that knows what was played."""
+    @property
+    def _modelled(self) -> bool:
+        """Whether the controller has an internal model."""
+        return bool(getattr(self._controller, "internal_model", False))
+
+    def _replace(self, state: Any, wanted: np.ndarray | None = None) -> None:
+        """Go on with a copy of a controller, which wanted to play `wanted` before, and with the limiter in use.
+
+        That knows what was played.
+        """
         other = deepcopy(state)
         for limiter in _limiters(other):  # which knows what was played before the copy was made
             limiter.reset()
         if _limiters(self.controller) and isinstance(other, CoreController | WrappedController):
             other.limiter = self.controller.limiter
         self.controller = other
-        self._wanted_y[:] = 0.0
+        if wanted is not None:
+            self._wanted_y = wanted
 
     @property
     def _target(self) -> float:
@@ -501,7 +512,7 @@ class Supervisor(Checkpointed):
             if what:
                 self._stop(f"diverged: {what}")
             elif self._good is not None and self._loud_windows == 0:
-                self._good = deepcopy(self.controller)
+                self._good = deepcopy(self.controller), self._wanted_y
             self._begin_window()
 
     def _divergence(self) -> str:
@@ -552,7 +563,7 @@ class Supervisor(Checkpointed):
         self._note(why)
         if self.on_divergence == "freeze":
             self._note("frozen")
-            self._replace(self._good)
+            self._replace(*self._good)
             self._frozen = self._pause
         elif self.on_divergence == "reset":
             self._note("reset")
@@ -605,6 +616,18 @@ def _limiters(controller: Any) -> tuple[OutputLimiter, ...]:
     limiter = getattr(controller, "limiter", None)
     limiters = limiter if isinstance(limiter, tuple) else (limiter,)
     return tuple(one for one in limiters if isinstance(one, OutputLimiter))
+
+
+def _modelled_samples(controller: Any) -> int:
+    """Return how many of its last control signals an internal model remembers, 0 without one."""
+    if not getattr(controller, "internal_model", False):
+        return 0
+    if hasattr(controller, "physical"):
+        raise ValueError(
+            "controller must not have virtual microphones and an internal model: its paths are not those to the error "
+            "microphones; let it run by its own process, without a supervisor"
+        )
+    return int(np.shape(controller.secondary_path)[-1]) - 1
 
 
 def _remembered(controller: Any) -> int:

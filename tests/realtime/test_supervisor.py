@@ -360,6 +360,55 @@ def test_an_internal_model_knows_of_fades_limits_and_bad_errors(n_references: in
     assert supervisor.health.counts.keys() == {"limited", "not finite"}
 
 
+def test_a_controller_with_a_longer_path_begins_as_if_nothing_had_been_played() -> None:
+    n, begin = round(2 * FS), 8000
+    d = np.sin(0.2 * np.arange(n)) + 0.05 * np.random.default_rng(3).standard_normal(n)
+
+    def made(path: np.ndarray) -> Any:
+        return with_internal_model(FxLMS(24, path, step_size=1e-3))
+
+    def played(path: np.ndarray, d: np.ndarray, spoil: Any) -> tuple[np.ndarray, Supervisor]:
+        supervisor = supervised(made(path))
+        interface = SimulatedInterface(None, S, disturbance=d, fs=FS, block=BLOCK, latency=LATENCY)
+        return loop(supervisor, interface, lambda x, e, first: spoil(supervisor, e, first))[0], supervisor
+
+    def assign(supervisor: Supervisor, e: np.ndarray, first: int) -> tuple[None, np.ndarray]:
+        if first == begin:
+            supervisor.controller = made(longer)
+        return None, e
+
+    longer = np.pad(PATH, (0, 40))
+    got, supervisor = played(PATH, d, assign)
+    expected, _ = played(longer, d[begin:], lambda supervisor, e, first: (None, e))
+    assert np.std(got[0, begin - 1000 : begin]) > 0.5  # of which the new one must not be told
+    np.testing.assert_allclose(got[0, begin:], expected[0], rtol=0, atol=1e-9)  # sums in another order
+    assert not supervisor.health.counts
+
+
+def test_a_frozen_internal_model_goes_on_with_the_reference_that_it_had() -> None:
+    """With an exact path, the weights of the last good window filter d(n - 1) alone, whatever was played meanwhile."""
+    n, window = round(2 * FS), 2000
+    d = np.sin(0.2 * np.arange(n)) + 0.05 * np.random.default_rng(3).standard_normal(n)
+    supervisor = supervised(
+        with_internal_model(FxLMS(24, PATH, step_size=1e-3)), on_divergence="freeze", pause_s=0.5, window_s=window / FS
+    )
+    interface = SimulatedInterface(None, S, disturbance=d, fs=FS, block=BLOCK, latency=LATENCY)
+    weights = []
+
+    def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[None, np.ndarray]:
+        weights.append(supervisor.controller.weights)
+        supervisor.largest_gain = 1e-3 if first == stop - BLOCK else 1e6
+        return None, e
+
+    good, stop = (-(-window // BLOCK) * BLOCK * windows for windows in (4, 5))  # the ends of windows
+    y, _ = loop(supervisor, interface, spoil)
+    assert supervisor.health.counts == {"diverged: weights": 1, "frozen": 1}
+    np.testing.assert_array_equal(weights[stop // BLOCK], weights[good // BLOCK])
+    frozen = slice(stop + 24, stop + round(0.5 * FS))  # from when the filter has forgotten what it heard before
+    expected = lfilter(weights[good // BLOCK], 1.0, np.roll(d, 1))[frozen]
+    np.testing.assert_allclose(y[0, frozen], expected, rtol=0, atol=1e-9)
+
+
 def test_fades_are_smooth() -> None:
     supervisor = Supervisor(Playing(lambda n: 1.0), fs=FS, amplitude_limit=2.0, fade_s=0.05)
     supervisor.start_silent()
