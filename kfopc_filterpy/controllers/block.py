@@ -12,7 +12,7 @@ from ..checkpoint import Checkpointed
 from .base import calls_of, require_rates
 from .channel_samples import LOUDEST, require_moderate
 from .channels import Channels
-from .processing import BlockProcessing, adapt_flags, output_array, require_apart, require_one_length, takes_none
+from .processing import BlockProcessing, checked_block
 
 LOUDEST_ERROR = 1e100  # above what weights up to MOST_WEIGHT can cause, so that they can adapt down again
 MOST_WEIGHT = 1e80  # a step that leads beyond it is left out
@@ -241,16 +241,10 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
         out: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the control signals for a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
-        takes_none(self, references)
-        x = self._block_signal(references, "references", self.n_references)
-        e = self._block_signal(errors, "errors", self.n_microphones)
+        x, e, flags, y = checked_block(self, references, errors, adapt, out)
         loud = np.abs(x).max() > LOUDEST or np.abs(e).max() > LOUDEST_ERROR
         if loud or not runs_in_blocks(self):
-            return super().process(x, e, adapt=adapt, out=out)  # up to the sample that is refused
-        require_one_length(x, e)
-        flags = adapt_flags(adapt, x.shape[-1])
-        require_apart(out, x, e)
-        y = output_array(out, (self.n_loudspeakers, x.shape[1]) if self.multichannel else x.shape)
+            return super().process(x, e, adapt=flags, out=y)  # up to the sample that is refused
         begin, signals = 0, [np.atleast_2d(signal) for signal in (x, e, y)]
         while begin < flags.size:
             part = slice(begin, begin + self.samples_left)

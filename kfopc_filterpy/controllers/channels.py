@@ -10,7 +10,7 @@ from .._validate import as_count, as_number
 from ..paths.path_matrix import is_path_matrix, secondary_paths, single_path
 from .base import require_rates
 from .channel_samples import channel_sample
-from .processing import block_signal, require_channels, takes_none
+from .processing import takes_none
 
 
 class Channels:
@@ -35,18 +35,19 @@ class Channels:
         self.multichannel = several or self.n_references > 1 if multichannel is None else multichannel
         self.n_microphones, self.n_loudspeakers = 1, 1
         secondary, self._path_fs = self._taps_and_rate(paths)
-        if not secondary.any():
-            raise ValueError(
-                "secondary_path must not be all zeros: nothing that the loudspeaker plays would be heard, so there is "
-                "nothing to adapt to; identify the path, see paths.identify_secondary_path"
-            )
         if self.multichannel:
             self.n_microphones, self.n_loudspeakers, _ = secondary.shape
         return secondary
 
     def _taps_and_rate(self, paths: Any) -> tuple[np.ndarray, float | None]:
         """Return secondary paths as taps, (K, J, taps) or (taps,), and their sampling rate in Hz if systems tell it."""
-        return secondary_paths(paths) if self.multichannel else single_path(paths, "secondary_path")
+        taps, rate = secondary_paths(paths) if self.multichannel else single_path(paths, "secondary_path")
+        if not taps.any():
+            raise ValueError(
+                "secondary_path must not be all zeros: nothing that the loudspeaker plays would be heard, so there is "
+                "nothing to adapt to; identify the path, see paths.identify_secondary_path"
+            )
+        return taps, rate
 
     def _sample(self, value: Any, name: str, what: str) -> Any:
         """Return a checked sample: a number, or with several channels an array of them; `what` names the channels."""
@@ -72,9 +73,3 @@ class Channels:
         if self._path_fs is not None:
             require_rates(self._path_fs, {"new secondary path": rate})
         return np.pad(taps, [(0, 0)] * (taps.ndim - 1) + [(0, present[-1] - taps.shape[-1])])
-
-    def _block_signal(self, value: Any, name: str, n_channels: int) -> np.ndarray:
-        """Return a block of samples, (n_samples,) or (n_channels, n_samples)."""
-        signal = block_signal(value, name)
-        require_channels(signal, name, self.multichannel, n_channels)
-        return np.ascontiguousarray(signal)

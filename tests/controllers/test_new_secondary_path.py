@@ -171,6 +171,7 @@ def test_a_shorter_path_is_filled_with_zeros_and_the_users_array_is_not_touched(
     [
         (S_HAT, np.ones(5), "at most the 4 taps of the present estimate, got 5"),
         (S_HAT, [0.0, np.nan], "secondary_path"),
+        (S_HAT, [0.0], "secondary_path must not be all zeros"),
         (fir_path(S_HAT, FS), fir_path([0.0, 1.0], 2 * FS), "secondary path is for 16000 Hz"),
         ([[S_HAT]], np.ones((2, 1, 4)), r"\(microphones, loudspeakers\) = \(1, 1\) of the present .* got \(2, 1\)"),
         ([[S_HAT]], np.ones((1, 1, 5)), "at most the 4 taps"),
