@@ -219,7 +219,8 @@ def simulate(
     )
     compiled = compiled and not any(any(own) for own, _ in amplifiers.values)
     looped = controller.looped() if compiled and isinstance(controller, CoreController) else None
-    in_blocks = compiled and runs_in_blocks(controller) and not feedback.values[0].size
+    each = feedback.values[0].size or any(hasattr(controller, name) for name in recorded)  # sample counts
+    in_blocks = compiled and runs_in_blocks(controller) and not each
     with getattr(controller, "in_use", nullcontext()):
         diverged, end = run.loop(looped) if looped else run.blocks(x) if in_blocks else run.steps(x)
     for signal in (*results, *recorded.values()):

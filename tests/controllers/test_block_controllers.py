@@ -225,6 +225,22 @@ def test_an_error_without_its_control_signal_is_refused() -> None:
         controller.update(1.0)
 
 
+def test_a_run_records_what_a_subclass_tells_after_each_sample() -> None:
+    class Counting(FrequencyDomainFxLMS):
+        @property
+        def constraint_factor(self) -> float:
+            return float(self.samples_left)
+
+    run = simulate(
+        Counting(16, SECONDARY, step_size=0.1, block_size=4),
+        np.ones(8),
+        primary_path=PRIMARY,
+        secondary_path=SECONDARY,
+        fs=FS,
+    )
+    np.testing.assert_array_equal(run.constraint_factor, [3, 2, 1, 4, 3, 2, 1, 4])
+
+
 def test_bands_are_for_one_sample_rate() -> None:
     controller = BandLimitedFxLMS(16, SECONDARY, step_size=0.1, block_size=8, **BANDS)
     with pytest.raises(ValueError, match="bands is for 16000 Hz"):

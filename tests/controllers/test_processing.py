@@ -18,7 +18,7 @@ from helpers.controllers import ALL
 from helpers.loop import S_HAT
 from helpers.simulation import X
 
-from kfopc_filterpy import KFOPC, FxLMS, KalmanController, kf_anc
+from kfopc_filterpy import KFOPC, FrequencyDomainFxLMS, FxLMS, KalmanController, kf_anc
 from kfopc_filterpy.controllers import RefusedUpdate
 
 MADE = ALL | {"two channels": lambda: FxLMS(8, random_paths(2, 2, 6, seed=1), step_size=1e-3, n_references=2)}
@@ -64,7 +64,21 @@ def test_a_subclass_with_its_own_step_is_called_for_each_sample() -> None:
     assert np.any(got != 0.0)
 
 
-@pytest.mark.parametrize("name", ["KF-OPC plain", "two channels", "VerifiedController", "FeedbackNeutralizer"])
+@pytest.mark.parametrize("kind", [FxLMS, FrequencyDomainFxLMS])
+def test_the_only_reference_of_several_channels_needs_no_channel_axis(kind: Any) -> None:
+    settings = {"step_size": 1e-2} | ({} if kind is FxLMS else {"block_size": 4})
+    with_axis, without = (kind(8, random_paths(2, 2, 6, seed=1), **settings) for _ in range(2))
+    x, e = X[:100], np.stack((X[100:200], X[200:300]))
+    without.listen(x, e)
+    with_axis.listen(x[np.newaxis], e)
+    expected = with_axis.process(x[np.newaxis], e)
+    assert np.any(expected)
+    np.testing.assert_array_equal(without.process(x, e), expected)
+
+
+@pytest.mark.parametrize(
+    "name", ["KF-OPC plain", "two channels", "frequency domain", "VerifiedController", "FeedbackNeutralizer"]
+)
 def test_bad_blocks_are_refused_before_anything_changes(name: str) -> None:
     controller = MADE[name]()
     shape = (2, 10) if name == "two channels" else (10,)
