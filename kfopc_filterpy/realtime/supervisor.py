@@ -159,11 +159,9 @@ class Supervisor(Checkpointed):
         self.fs = as_positive(fs, "fs", unit="Hz")
         if hasattr(controller, "require_sample_rate"):
             controller.require_sample_rate(self.fs)
-        self.multichannel = bool(getattr(controller, "multichannel", False))
-        counts = ("n_references", "n_microphones", "n_loudspeakers")
-        self.n_references, self.n_microphones, self.n_loudspeakers = (
-            int(getattr(controller, count, 1)) for count in counts
-        )
+        counts = [int(getattr(controller, f"n_{what}", 1)) for what in ("references", "microphones", "loudspeakers")]
+        self.n_references, self.n_microphones, self.n_loudspeakers = counts
+        self.multichannel = bool(getattr(controller, "multichannel", max(counts) > 1))
         self.amplitude_limit = per_loudspeaker(amplitude_limit, self.n_loudspeakers, "amplitude_limit")
         self.on_divergence = as_choice(on_divergence, "on_divergence", ACTIONS)
         self.largest_gain = as_positive(largest_gain, "largest_gain")

@@ -325,6 +325,17 @@ def test_long_faults_fade_out_and_in_again() -> None:
     assert np.std(y[0, 21000:]) > 0.1
 
 
+def test_a_users_controller_gets_all_channels_that_it_states() -> None:
+    class Sum(Playing):
+        n_references = 2
+
+        def control_signal(self, reference: Any) -> np.ndarray:
+            return np.sum(reference, keepdims=True)
+
+    x = np.random.default_rng(0).standard_normal((2, 8))
+    np.testing.assert_array_equal(supervised(Sum(abs)).process(x, 0.1 * x[:1]), [x[0] + x[1]])
+
+
 @pytest.mark.parametrize("n_references", [0, 1], ids=["feedback", "hybrid"])
 def test_an_internal_model_knows_of_fades_limits_and_bad_errors(n_references: int) -> None:
     """With an exact path, what is played is the settled filter's output for x and d(n - 1), faded and limited.
