@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 from .._types import ChangingPaths, PerLoudspeaker, Seed
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
 from ..controllers.base import Controller, Looped, checked_controller, differing_counts, listening
-from ..controllers.block import runs_in_blocks
+from ..controllers.block import LOUDEST_ERROR, runs_in_blocks
+from ..controllers.channel_samples import LOUDEST
 from ..controllers.channels import Channels
 from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..controllers.processing import takes_none
@@ -315,12 +316,15 @@ class _Run:
     def blocks(self, x: np.ndarray) -> tuple[bool, int]:
         """Do what `steps` does for a controller that keeps its control filter for a block, in stretches within its blocks."""
         begin, changes, n_samples, limit = 0, 0, x.shape[1], self.plant.limit[:, None]
+        # The first sample that the controller refuses begins a stretch, so that those before it are run.
+        loud = np.any(np.abs(x) > LOUDEST, axis=0) | np.any(np.abs(self.signals.disturbance) > LOUDEST_ERROR, axis=0)
+        refused = int(np.argmax(loud)) if loud.any() else n_samples
         while begin < n_samples:
             if begin == changes:
                 changes = self.set_plant(begin)
             row = -(-begin // self.every)  # of the next weights that are recorded
             noted = row * self.every + 1 if len(self.weights) else n_samples + 1
-            end = min(begin + self.controller.samples_left, changes, noted, n_samples)
+            end = min(begin + self.controller.samples_left, changes, noted, max(refused, begin + 1))
             with naming_sample(begin):
                 y = self.controller.emit(x[:, begin:end], limit)
                 if not np.all(np.abs(y[:, 0]) <= limit[:, 0]):

@@ -225,6 +225,15 @@ def test_an_error_without_its_control_signal_is_refused() -> None:
         controller.update(1.0)
 
 
+@pytest.mark.parametrize(("where", "largest"), [("reference", 1e20), ("disturbance", 1e100)])
+def test_a_run_names_the_sample_that_is_refused(where: str, largest: float) -> None:
+    signals = dict(zip(("reference", "disturbance"), coloured(0.01), strict=True))
+    signals[where][77] = 2.0 * largest
+    for compiled in (True, False):
+        with pytest.raises(ValueError, match=r"must not be louder than 1e\+\d+: .*\nin sample 77 of the run"):
+            simulate(near_wiener(), secondary_path=SECONDARY, fs=FS, compiled=compiled, **signals)
+
+
 def test_a_run_records_what_a_subclass_tells_after_each_sample() -> None:
     class Counting(FrequencyDomainFxLMS):
         @property
