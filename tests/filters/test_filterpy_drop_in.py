@@ -137,7 +137,8 @@ def test_thousands_of_steps_of_any_kind(n: int, m: int, k: int, x_ndim: int) -> 
         if step % 25 == 0:
             require_same(kf, ours)
             z, u = rng.normal(size=kf.y.shape), rng.normal(size=(k, 1)[:x_ndim]) if k else None
-            assert same(kf.get_prediction(u), ours.get_prediction(u))
+            if k or FILTERPY_2:  # without B, 1.4.5 has no prediction
+                assert same(kf.get_prediction(u), ours.get_prediction(u))
             assert same(kf.get_update(z), ours.get_update(z))
             assert same(kf.residual_of(z), ours.residual_of(z))
             assert same(kf.log_likelihood_of(z), ours.log_likelihood_of(z))
