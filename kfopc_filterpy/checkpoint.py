@@ -2,7 +2,7 @@
 
 A file has four parts::
 
-    kfopc checkpoint 2 of kfopc_filterpy 2.0: 4711\n    the format, the version that wrote it, the pickle's size
+    kfopc checkpoint 3 of kfopc_filterpy 2.0: 4711\n    the format, the version that wrote it, the pickle's size
     a pickle                                            the object without the memory of its arrays, see `_pickles`
     memory of the arrays                                each begins at a multiple of 64 bytes, a cache line
     64 hexadecimal digits                               SHA-256 of everything before them
@@ -27,7 +27,7 @@ from . import _pickles
 from ._writing import replacing
 from .core.library import LINE, at_cache_line
 
-FORMAT = 2
+FORMAT = 3
 DIGEST = 64  # hexadecimal digits of SHA-256
 
 

@@ -53,7 +53,7 @@ def test_a_file_has_a_first_line_a_pickle_arrays_at_cache_lines_and_a_checksum(s
     first = content.partition(b"\n")[0].decode()
     series = ".".join(kfopc_filterpy.__version__.split(".")[:2])
     begins, _, size = first.rpartition(" ")
-    assert begins == f"kfopc checkpoint 2 of kfopc_filterpy {series}:"
+    assert begins == f"kfopc checkpoint 3 of kfopc_filterpy {series}:"
     assert hashlib.sha256(content[:-64]).hexdigest() == content[-64:].decode()
     arrays = len(first) + 1 + int(size)
     arrays += -arrays % 64
@@ -210,11 +210,11 @@ def test_another_format_is_refused_and_another_version_if_its_series_differs(sav
     series = ".".join(kfopc_filterpy.__version__.split(".")[:2])
     _, _, rest = content.partition(b": ")
     reads = (
-        rf"and this version reads 'kfopc checkpoint 2 of kfopc_filterpy {series}' only: load the file with the version"
+        rf"and this version reads 'kfopc checkpoint 3 of kfopc_filterpy {series}' only: load the file with the version"
     )
     with pytest.raises(ValueError, match=rf"old.kfopc is a 'kfopc checkpoint 1', {reads}"):
         KFOPC.load(sealed(old, b'kfopc checkpoint 1 17\n{"package":"1.0"}\n'))
-    for begins in ("checkpoint 3 of kfopc_filterpy " + series, "checkpoint 2 of kfopc_filterpy 1.9", "checkpoint 2"):
+    for begins in ("checkpoint 2 of kfopc_filterpy " + series, "checkpoint 3 of kfopc_filterpy 1.9", "checkpoint 3"):
         with pytest.raises(ValueError, match=rf"is a 'kfopc {begins}', {reads}"):
             KFOPC.load(sealed(old, f"kfopc {begins}: ".encode() + rest))
     for begins in (b"\xff\xfe", b"", b"\n"):

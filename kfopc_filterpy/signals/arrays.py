@@ -28,6 +28,10 @@ def read_npy(path: str | os.PathLike[str]) -> Content:
             raise ValueError(f"{path} must hold real numbers, got {header.dtype}")
         require_room(path, math.prod(header.shape))
         array = _read_array(file, header)
+        if file.read(1):
+            raise ValueError(
+                f"{path} goes on after its array: save one array in a .npy file, or several in a .npz file"
+            )
     if array.size == 0:
         raise ValueError(f"{path} holds no samples, shape {array.shape}: expected at least one")
     return Content(array)

@@ -293,6 +293,9 @@ def test_a_file_without_samples_is_refused(tmp_path):
     for name in ("x.wav", "x.aiff", "x.flac"):
         soundfile.write(tmp_path / name, np.zeros((0, 2)), FS)
     np.save(tmp_path / "x.npy", np.zeros((2, 0)))
+    with open(tmp_path / "two.npy", "wb") as file:
+        np.save(file, signal())
+        np.save(file, signal())
     np.savez(tmp_path / "x.npz", noise=np.zeros(0))
     scipy.io.savemat(tmp_path / "x.mat", {"noise": np.zeros((0, 0))})
     (tmp_path / "x.csv").write_text("left,right\n")
@@ -301,6 +304,7 @@ def test_a_file_without_samples_is_refused(tmp_path):
         ("x.aiff", "holds no samples: its header claims zero frames"),
         ("x.flac", r"is empty \(0 bytes\)"),  # libsndfile writes nothing
         ("x.npy", r"holds no samples, shape \(2, 0\)"),
+        ("two.npy", "goes on after its array: save one array"),
         *((name, rf"variable 'noise' of .*{name} is empty") for name in ("x.npz", "x.mat")),
         ("x.csv", "is text that is no numbers"),
     ):
