@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import os
 import re
 import shlex
 from inspect import signature
@@ -45,14 +46,13 @@ def test_a_process_ends_with_0_if_the_amplifier_is_enough_and_writes_what_it_say
 
 
 @pytest.mark.slow
-def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(tmp_path, monkeypatch, capsys):
+def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(inside, capsys):
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     start = next(number for number, line in enumerate(lines) if "kfopc demo" in line and line.startswith(".venv"))
     _, write, folder = lines[start].split(" && ")[0].split()
-    monkeypatch.chdir(tmp_path)
     assert main([write, folder]) == 0
     assert lines[start].endswith(f" && cd {folder}")
-    monkeypatch.chdir(folder)
+    os.chdir(folder)  # `inside` goes back
     pasted = lines[start + 1].split()
     assert pasted[0] == "../.venv/bin/kfopc"
     assert main(pasted[1:]) == 0

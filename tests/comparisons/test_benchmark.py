@@ -176,13 +176,12 @@ def test_every_entry_has_a_score_or_a_reason(short: Task, tmp_path: Path) -> Non
 
 def command(tmp_path: Path, text: str) -> str:
     file = tmp_path / "entry.py"
-    file.write_text(text, encoding="utf-8")
+    file.write_text(f"import sys\nsys.path.append({str(ROOT)!r})\n{text}", encoding="utf-8")
     return f"{sys.executable} {file}"
 
 
-def test_the_command_of_the_page_gives_the_run_of_the_object(short: Task, tmp_path: Path, monkeypatch) -> None:
+def test_the_command_of_the_page_gives_the_run_of_the_object(short: Task, tmp_path: Path) -> None:
     """Its blocks hold what a run sample by sample holds, because the secondary path begins with a block of zeros."""
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     (text,) = [text for text in PYTHON if "FxNLMS" in text]
     assert len(text.strip().splitlines()) <= 12
     with CommandController(short, command(tmp_path, text)) as entry:
@@ -193,15 +192,14 @@ def test_the_command_of_the_page_gives_the_run_of_the_object(short: Task, tmp_pa
     np.testing.assert_allclose(blocks.control_signal[delay:], own.control_signal[:-delay], atol=1e-9)
 
 
-def test_the_object_of_the_page_runs(short: Task, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_the_object_of_the_page_runs(short: Task, inside: Path, monkeypatch, capsys) -> None:
     (text,) = [text for text in PYTHON if "control_signal" in text]
     monkeypatch.setattr(study, "read_task", lambda path: replace(short, name=path.stem))
-    monkeypatch.chdir(tmp_path)
     exec(compile(text, "page", "exec"), {"__name__": "__main__"})
     rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("mine")]
     assert rows
     assert "failed" not in "".join(rows)
-    written = json.loads((tmp_path / "benchmark" / "benchmark.json").read_text(encoding="utf-8"))
+    written = json.loads((inside / "benchmark" / "benchmark.json").read_text(encoding="utf-8"))
     assert "mine" in [one["entry"] for one in written["tasks"]["bandpass"]["scores"]]
 
 
