@@ -169,7 +169,7 @@ def bare(session: nox.Session) -> None:
     if not re.search(r"needs a C compiler: install gcc or clang .* -m pip install ziglang", said):
         session.error(f"no line says what to install: {said}")
     session.install("--no-deps", tree, env=without_compiler)
-    session.install(*PINNED, "--no-deps", "lazy-loader", "packaging")
+    session.install(*PINNED, "--no-deps", "numpy", "lazy-loader", "packaging")
     load = "from kfopc_filterpy.core.library import load; print(load('double').path.name, load('float').path.name)"
     session.run("python", "-I", "-c", load)
 
