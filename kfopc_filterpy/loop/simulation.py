@@ -118,7 +118,8 @@ def simulate(
         Gain in dB of `reference`, and so of the disturbance that `primary_path` makes; not together with `disturbance`.
     crossfade_s : float, default 0
         Duration in s of a change of the paths or the level, at most the shortest time between two changes. Meanwhile the
-        taps, or the gains, are interpolated linearly between the old and the new, for each sample. 0 switches at once; amplifiers are always switched.
+        taps, or the gains, are interpolated linearly between the old and the new, for each sample. 0 switches at once;
+        amplifiers are always switched.
     record_weights_every : int, optional
         Record the control filter (a controller's `control_filter`, or else its `weights`) every so many samples.
     record_powers : bool, default False
