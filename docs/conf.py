@@ -17,7 +17,7 @@ project = "kfopc_filterpy"
 version = metadata.version(project)
 author = "The kfopc_filterpy developers"
 copyright = author
-exclude_patterns = ["_build", "figures", "paper", "**.ipynb_checkpoints"]
+exclude_patterns = ["_build", "figures", "**.ipynb_checkpoints"]
 
 extensions = [
     "sphinx.ext.autodoc",

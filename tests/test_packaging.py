@@ -6,7 +6,6 @@ import importlib
 import importlib.metadata
 import importlib.resources
 import inspect
-import json
 import re
 import subprocess
 import sys
@@ -14,7 +13,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -108,24 +106,6 @@ def test_version_is_the_same_everywhere():
     assert released is not None
     headings = [line for line in read("CHANGELOG.md").splitlines() if line.startswith("## ")]
     assert headings[0] in ("## [Unreleased]", f"## [{version}] - {released[1]}")
-
-
-def test_codemeta_says_what_pyproject_and_the_citation_say():
-    said, project = json.loads(read("codemeta.json")), tomllib.loads(read("pyproject.toml"))["project"]
-    citation = yaml.safe_load(read("CITATION.cff"))
-    assert [said[key] for key in ("name", "description", "keywords")] == [
-        project[key] for key in ("name", "description", "keywords")
-    ]
-    assert said["runtimePlatform"] == f"CPython {project['requires-python']}"
-    assert said["softwareRequirements"] == [Requirement(line).name for line in project["dependencies"]]
-    assert (said["version"], said["dateModified"]) == (citation["version"], str(citation["date-released"]))
-    assert said["license"].split("/")[-1] == citation["license"] == project["license"]
-    names = [author["name"] for author in said["author"]]
-    assert names == [author["name"] for author in citation["authors"]] == [a["name"] for a in project["authors"]]
-    assert f'version: "{said["version"]}"' in read(".conda/recipe.yaml")
-    (paper,) = citation["references"]
-    published = said["referencePublication"]
-    assert (published["name"], published["identifier"]) == (paper["title"], paper["identifiers"][0]["value"])
 
 
 def test_every_requirement_is_pinned_within_its_range():
