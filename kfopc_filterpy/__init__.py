@@ -8,4 +8,4 @@ namespace's, and is loaded when it is first used.
 import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__version__ = "2.0.0"
+__version__ = "1.0.0"

@@ -105,7 +105,7 @@ def test_version_is_the_same_everywhere():
     released = re.search(r"^date-released: *(\S+)$", read("CITATION.cff"), flags=re.MULTILINE)
     assert released is not None
     headings = [line for line in read("CHANGELOG.md").splitlines() if line.startswith("## ")]
-    assert headings[0] in ("## [Unreleased]", f"## [{version}] - {released[1]}")
+    assert headings == [f"## [{version}] - {released[1]}"]
 
 
 def test_every_requirement_is_pinned_within_its_range():
@@ -147,30 +147,3 @@ def test_the_installation_page_says_what_each_extra_is_for():
     rows = re.findall(r"^\| (`.*?) \|", read("docs/install.md"), flags=re.M)
     named = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
     assert sorted(named) == sorted(tomllib.loads(read("pyproject.toml"))["project"]["optional-dependencies"])
-
-
-REMOVED = {
-    "bench": {"Levels": "SoundLevels", "Verdict": "Claim", "verdict_sentence": "claims_sentence"},
-    "controllers": {
-        **dict.fromkeys(("DirectPowerBudget", "SharedGainKalman", "FrequencyDomainKalman"), "kf_pb"),
-        **dict.fromkeys(("PathTracker", "MonitoredController"), "VerifiedController"),
-        **dict.fromkeys(("PathChange", "HealthEvent"), "PathEvent"),
-    },
-    "filters": {"PowerBudgetKalmanFilter": "kf_pb"},
-    "power": {"PowerBudget": "kf_pb"},
-    "realtime": {"Levels": "RunStatus"},
-}
-
-
-@pytest.mark.parametrize(
-    ("namespace", "name", "instead"),
-    [(space, name, instead) for space, names in REMOVED.items() for name, instead in names.items()],
-)
-def test_a_removed_name_says_what_to_use(namespace, name, instead):
-    module = importlib.import_module(f"kfopc_filterpy.{namespace}")
-    with pytest.raises(AttributeError, match=rf"kfopc_filterpy\.{namespace} has no {name} any more: use {instead}\b"):
-        getattr(module, name)
-    assert instead in {*dir(module), *dir(kfopc_filterpy)}
-    assert name not in dir(module)
-    with pytest.raises(AttributeError, match="no_such_name"):
-        _ = module.no_such_name

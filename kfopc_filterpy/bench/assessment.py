@@ -41,7 +41,7 @@ from .fixed_filters import longest_filter
 from .limits import Limits
 from .study_report import jsonable
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 1
 SCHEMA = Path(__file__).with_name("verdict.schema.json")
 ROOM_FOR_RESPONSE = 1.25  # times the time that a control filter must last
 MOST_TAPS = 1024  # that advice names: longer filters take very long
