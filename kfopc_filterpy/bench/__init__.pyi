@@ -4,12 +4,6 @@ from .assessment import Band as Band
 from .assessment import Ceilings as Ceilings
 from .assessment import SoundLevels as SoundLevels
 from .comparing import compare_recordings as compare_recordings
-from .exploring import AcousticSetup as AcousticSetup
-from .exploring import ExploreResult as ExploreResult
-from .exploring import ExploreSettings as ExploreSettings
-from .exploring import explore as explore
-from .exploring import explore_setups as explore_setups
-from .exploring_page import serve_explore as serve_explore
 from .opening import claims_sentence as claims_sentence
 from .registry import Algorithm as Algorithm
 from .registry import algorithms as algorithms

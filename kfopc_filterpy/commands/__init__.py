@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from .. import __version__
-from . import compare, completion, data, demo, explore, export, paths, run, verdict
+from . import compare, completion, data, demo, export, paths, run, verdict
 from .options import WRONG_INPUT, Parser
 
 PIPE_CLOSED = 141  # as of a program that SIGPIPE ends
@@ -20,7 +20,6 @@ EXAMPLES = """examples:
   kfopc compare noise.wav --primary P.wav --secondary S.wav --rated-power 1.6 --algorithm KF-PB,FxLMS -o out
   kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --seconds 20
   kfopc export controller.toml -o firmware --dtype float32
-  kfopc explore
   kfopc data list
   kfopc demo FOLDER
 each command has its own --help
@@ -69,7 +68,7 @@ def whole_parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"kfopc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in (verdict, compare, paths, run, export, explore, data, demo):
+    for module in (verdict, compare, paths, run, export, data, demo):
         module.add_to(commands)
     completion.add_to(commands, parser)
     return parser

@@ -11,10 +11,9 @@ import sys
 
 import numpy as np
 import pytest
-import scipy.signal
 from helpers.commands import FS, ROOT, SCENE, process
 
-from kfopc_filterpy import __version__, bench
+from kfopc_filterpy import __version__
 from kfopc_filterpy.signals import write_wav
 
 
@@ -76,7 +75,6 @@ ERRORS = {
     "verdict noise.wav PATHS --rated-power 1 --path-error-db 30": "--path-error-db must be at most 20, got 30",
     "verdict noise.wav PATHS --rated-power 1 --pascal-per-unit 1 --pascal-per-unit 1": "must be given once",
     "verdict noise.wav PATHS --rated-power 1 -o noise.wav": "noise.wav is a file: name a folder",
-    "explore --port -1": "--port must be at least 0, got -1",
     # Files.
     "verdict noise.wav --secondary S.wav --rated-power 1": "--primary or --disturbance is needed",
     "verdict empty.wav PATHS --rated-power 1": "empty.wav",
@@ -92,7 +90,7 @@ ERRORS = {
     # Sampling rates.
     "verdict noise.wav --primary P.wav --secondary S16.wav --rated-power 1": "for example with --fs 16000",
     "verdict noise.wav PATHS --rated-power 1 --fs -1": "--fs must be greater than 0 Hz, got -1",
-    "explore noise.wav --primary P.wav --secondary untimed.npy": "untimed.npy states no sampling",
+    "verdict noise.wav --primary P.wav --secondary untimed.npy --rated-power 1": "untimed.npy states no sampling",
     "paths convert S.wav x.npy --file-fs 8000": "--file-fs is for files that state no rate",
     "paths resample untimed.npy x.wav --fs 8000": "for example with --file-fs 48000",
     # Channels.
@@ -155,19 +153,6 @@ def test_help_says_what_it_does_and_shows_an_example(command, arguments):
     if arguments != ["paths"]:
         assert "example" in out
         assert f"  kfopc {' '.join(arguments)}".rstrip() in out
-
-
-def test_explore_takes_files_as_the_others_do_and_resamples_high_rates(command, folder, monkeypatch):
-    served = []
-    monkeypatch.setattr(bench, "serve_explore", lambda setups, port: served.extend(setups))
-    x = np.random.default_rng(0).standard_normal((2, 48000))
-    write_wav(folder / "fast.wav", x, 48000)
-    np.save(folder / "P.npy", np.eye(400)[144])
-    files = ["fast.wav:1", "--primary", "P.npy", "--secondary", "P.npy", "--file-fs", 48000]
-    assert command("explore", *files)[0] == 0
-    setup = served[0]
-    assert (setup.fs, setup.noise.size, int(np.argmax(setup.primary))) == (16000, 16000, 48)
-    np.testing.assert_array_equal(setup.noise, scipy.signal.resample_poly(x[1].astype(np.float32).astype(float), 1, 3))
 
 
 def test_help_loads_nothing_that_takes_long():
