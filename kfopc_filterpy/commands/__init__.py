@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from .. import __version__
-from . import compare, completion, data, demo, export, paths, run, verdict
+from . import compare, data, demo, export, paths, run, verdict
 from .options import WRONG_INPUT, Parser
 
 PIPE_CLOSED = 141  # as of a program that SIGPIPE ends
@@ -70,5 +70,4 @@ def whole_parser() -> Parser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for module in (verdict, compare, paths, run, export, data, demo):
         module.add_to(commands)
-    completion.add_to(commands, parser)
     return parser

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
-import shutil
 import subprocess
 import sys
 
@@ -27,27 +25,6 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
 
 def test_the_version_is_printed(command):
     assert command("--version") == (0, f"kfopc {__version__}\n", "")
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
-@pytest.mark.parametrize(
-    ("words", "completed"),
-    [
-        (["data", "fe"], ["fetch"]),
-        (["verdict", "--pri"], ["--primary"]),
-        (["paths", "resample", "S"], ["S.wav", "S16.wav"]),
-    ],
-)
-def test_bash_completes_commands_options_and_files(folder, command, words, completed):
-    script = command("completion", "bash")[1]
-    script += f"""
-COMP_WORDS=(kfopc {shlex.join(words)})
-COMP_CWORD={len(words)}
-_shtab_kfopc kfopc {words[-1]} {["kfopc", *words][-2]}
-printf '%s\\n' "${{COMPREPLY[@]}}"
-"""
-    ran = subprocess.run(["bash", "-c", script], cwd=folder, capture_output=True, text=True)
-    assert sorted(ran.stdout.split()) == completed, ran.stderr
 
 
 PATHS = "--primary P.wav --secondary S.wav"
