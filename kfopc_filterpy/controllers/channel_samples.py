@@ -34,13 +34,7 @@ def amplifier_functions(amplifier: Amplifiers, n_loudspeakers: int) -> list[Any]
     """Return the functions of a sample that stand for the amplifiers, one for each loudspeaker; None without any."""
     if amplifier is None:
         return None
-    each = amplifier_of_each(amplifier, n_loudspeakers)
-    if any(hasattr(one, "at_rest") for one in each):
-        raise TypeError(
-            "amplifier must be without memory: a controller also asks what other signals would become; give it the model "
-            f"that comes nearest, or None, got {amplifier!r}"
-        )
-    return [LinearAmplifier() if one is None else one for one in each]
+    return [LinearAmplifier() if one is None else one for one in amplifier_of_each(amplifier, n_loudspeakers)]
 
 
 def amplified(amplifiers: list[Any] | None, y: np.ndarray) -> np.ndarray:

@@ -98,8 +98,7 @@ def simulate(
         Sample rate in Hz; paths given as systems must have the same.
     amplifier : callable, optional
         Amplifier model, or any function of a sample that returns a finite number; by default linear. With several
-        loudspeakers one for all, or a sequence with one for each. One with memory, such as
-        `power.ExcursionLimitedLoudspeaker`, has a method ``at_rest()`` that returns the copy used in the run.
+        loudspeakers one for all, or a sequence with one for each.
     rated_power : float or array_like, optional
         Rated power, which sets the scale of the divergence limit, of all loudspeakers or of each, (J,); by default the
         controller's, or 1 if it has none.

@@ -1,4 +1,3 @@
-from .loudspeaker import ExcursionLimitedLoudspeaker as ExcursionLimitedLoudspeaker
 from .ratings import AmplifierRating as AmplifierRating
 from .ratings import LoudspeakerRating as LoudspeakerRating
 from .ratings import OutputLimits as OutputLimits

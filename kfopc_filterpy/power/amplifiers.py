@@ -129,15 +129,12 @@ def _each(amplifier: Any, n_loudspeakers: int) -> list[Any]:
 
 
 def amplifier_of_each(amplifier: Any, n_loudspeakers: int, of: str = "sample") -> list[Any]:
-    """Return for each loudspeaker a function that stands for its amplifier, or None, from one for all or one for each.
-
-    One with memory is a copy at rest: no other loudspeaker and no other run has a part in what it remembers.
-    """
+    """Return for each loudspeaker a function that stands for its amplifier, or None, from one for all or one for each."""
     each = _each(amplifier, n_loudspeakers)
     if len(each) != n_loudspeakers or not all(one is None or callable(one) for one in each):
         for_each = f", or one for each of the {n_loudspeakers} loudspeakers" if n_loudspeakers > 1 else ""
         raise TypeError(f"amplifier must be a function of a {of}{for_each}, or None, got {amplifier!r}")
-    return [one.at_rest() if hasattr(one, "at_rest") else one for one in each]
+    return each
 
 
 def amplifier_models(amplifier: Amplifier | Sequence[Amplifier | None] | None, n_loudspeakers: int) -> np.ndarray:
