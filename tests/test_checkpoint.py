@@ -258,7 +258,7 @@ FORGED: dict[str, tuple[bytes, str]] = {
     "code": (called("builtins:eval", text("open('{trace}', 'w')")), "names builtins.eval"),
     "a dotted name": (called("kfopc_filterpy.checkpoint:os.system", text("touch {trace}")), "os.system, which is none"),
     "a library": (called("kfopc_filterpy.core.block:Algorithm", text("{trace}")), "says itself how it is copied"),
-    "a function of the package": (called("kfopc_filterpy.core.own:load_algorithm", text("a.c")), "none of"),
+    "a function of the package": (called("kfopc_filterpy.core.library:load", text("double")), "none of"),
     "a module that is not there": (called("kfopc_filterpy.power.nothing:A"), "ModuleNotFoundError"),
     "a constructor": (called(f"{CLASS}:OutputLimiter", text("1")), "OutputLimiter has other fields"),
     "a call of a function that can be named": (called("numpy.linalg:inv", b"]"), "something is made of other parts"),

@@ -1,6 +1,5 @@
 from .base import Controller as Controller
 from .core_controller import CoreController as CoreController
-from .core_controller import load_algorithm as load_algorithm
 from .direct import DirectKalman as DirectKalman
 from .feedback import FeedbackNeutralizer as FeedbackNeutralizer
 from .internal_model import with_internal_model as with_internal_model

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from .._types import NumberOrArray, PathModels, PerLoudspeaker
 from .._validate import as_count, as_positive, per_channel, per_loudspeaker
 from ..checkpoint import Checkpointed
-from ..core.block import Algorithm, Block, InUse, Shape, reason_of
-from ..core.own import load_algorithm as load_algorithm
+from ..core.block import REASONS, Algorithm, Block, InUse, Shape
 from ..core.run_loop import REFUSED_REFERENCE, Steps, process
 from ..paths.uncertainty import Uncertainty, as_uncertainty, guard_filter
 from ..power.amplifiers import Amplifiers, amplifier_models
@@ -56,7 +55,6 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     """Base class of the built-in controllers: channels, paths, limiter, constraint, and an algorithm of the core.
 
     A subclass names its `algorithm` in C and the `checks` of its settings, and passes the settings by their names in C.
-    For an algorithm of your own, see `load_algorithm`.
 
     Parameters
     ----------
@@ -84,8 +82,8 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
     Attributes
     ----------
-    algorithm : str or Algorithm
-        Name of an algorithm of the core, or what `load_algorithm` returns. An attribute of the class.
+    algorithm : str
+        Name of an algorithm of the core. An attribute of the class.
     checks : mapping of str to callable
         Functions of a value and its name that return a setting as a float, or raise ValueError; settings without one
         must be positive. An attribute of the class.
@@ -119,7 +117,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     """
 
     name = "controller"
-    algorithm: str | Algorithm
+    algorithm: str
     checks: ClassVar[Mapping[str, Callable[[Any, str], float]]] = {}  # of settings that need not be positive
     needs_rated_power: ClassVar[bool] = False  # or a constraint
     takes_guard: ClassVar[bool] = True  # whether the step takes account of an uncertain secondary path
@@ -230,7 +228,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     # The block.
 
     def _algorithm(self) -> Algorithm:
-        return Algorithm(self.algorithm) if isinstance(self.algorithm, str) else self.algorithm
+        return Algorithm(self.algorithm)
 
     def _needed_shape(self, path_taps: int, guard_taps: int) -> Shape:
         """Return the shape of a block for the present limiter and constraint."""
@@ -487,7 +485,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         try:
             block.reference[:] = x
             if answer := block.emit():
-                raise ValueError(f"{reason_of(answer)}; nothing was changed")
+                raise ValueError(f"{REASONS[answer]}; nothing was changed")
             return self._shaped(block.control_signal)
         finally:
             block.leave()
@@ -507,7 +505,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         try:
             block.error[:] = e
             if answer := getattr(block, step)():
-                raise ValueError(f"{reason_of(answer)}; nothing was changed")
+                raise ValueError(f"{REASONS[answer]}; nothing was changed")
         finally:
             block.leave()
 
@@ -568,7 +566,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
             part = slice(begin, begin + LONGEST_CALL)
             done, answer = block.listen(x[part], e[part], adapting[part])
             if answer:
-                raise refused_while_listening(reason_of(answer), begin + done)
+                raise refused_while_listening(REASONS[answer], begin + done)
         return len(x)
 
     def looped(self) -> Looped | None:

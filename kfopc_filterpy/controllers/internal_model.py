@@ -34,7 +34,7 @@ def with_internal_model(controller: _Made) -> _Made:
     ----------
     controller : CoreController
         Any controller whose steps are in the core, made with ``n_references=K`` for K error microphones, or
-        ``n_references=I + K`` for hybrid control with I reference microphones. An algorithm of your own in C works too.
+        ``n_references=I + K`` for hybrid control with I reference microphones.
         It is not changed.
 
     Returns

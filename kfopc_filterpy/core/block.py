@@ -6,7 +6,6 @@ import ctypes
 import threading
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,11 +32,6 @@ REASONS = {
     "again at these weights. Use memory= instead of a forgetting factor, or kf_anc, whose O(L^2) form does not lose its "
     "covariance",
 }
-
-
-def reason_of(answer: int) -> str:
-    """Return why a step was refused; an algorithm of one's own may have answers of its own."""
-    return REASONS.get(answer, f"the algorithm refused it with the answer {answer}")
 
 
 class _Plan(ctypes.Structure):
@@ -73,31 +67,28 @@ class Setting(NamedTuple):
 
 
 class Algorithm:
-    """An algorithm of the core, or of a library that somebody built from a C file of his own.
+    """An algorithm of the core.
 
     Parameters
     ----------
     name : str
         Name in C, without the prefix ``anc_``.
-    path : str or Path, optional
-        Library that has it, see `load_algorithm`; by default the core's.
     real : {"double", "float"}
         Type of the core's numbers.
 
     Raises
     ------
     ValueError
-        If the library has no algorithm of that name.
+        If the core has no algorithm of that name.
     """
 
-    def __init__(self, name: str, path: str | Path | None = None, real: str = "double") -> None:
-        self.name, self.path, self.precision = name, None if path is None else str(path), _PRECISIONS[real]
+    def __init__(self, name: str, real: str = "double") -> None:
+        self.name, self.real, self.precision = name, real, _PRECISIONS[real]
         self.library: Library = load(real)
-        library = self.library.held if path is None else ctypes.PyDLL(str(path))
         try:
-            self._struct = _Algorithm.in_dll(library, f"anc_{name}")
+            self._struct = _Algorithm.in_dll(self.library.held, f"anc_{name}")
         except ValueError:
-            raise ValueError(f"{self.path or 'the core'} has no algorithm anc_{name}") from None
+            raise ValueError(f"the core has no algorithm anc_{name}") from None
         self.pointer = ctypes.addressof(self._struct)
         self.settings: list[Setting] = []
         if real == "float":  # whose table has floats in it, where `_Setting` has doubles
@@ -122,7 +113,7 @@ class Algorithm:
         return fields_of(self.library.held.anc_describe, self.pointer, ctypes.byref(plan))
 
     def __reduce__(self) -> Any:
-        return Algorithm, (self.name, self.path)
+        return Algorithm, (self.name, self.real)
 
 
 @dataclass(frozen=True)

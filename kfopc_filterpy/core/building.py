@@ -1,4 +1,4 @@
-"""Compile the core, or an algorithm of one's own, with the machine's C compiler or with zig's, which comes as a wheel.
+"""Compile the core with the machine's C compiler or with zig's, which comes as a wheel.
 
 The build of the package loads this file by its path, so it imports nothing of the package.
 """

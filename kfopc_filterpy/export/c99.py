@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 EXPORTED = (
     "export_c takes the controllers whose algorithm is in the package's core. It takes no wrapper (export the inner "
-    "controller), no algorithm of one's own and no subclass with calls of its own"
+    "controller) and no subclass with calls of its own"
 )
 
 
@@ -174,8 +174,6 @@ def exportable(controller: Any) -> Block:
         obstacle = "is not in the core"
     elif calls_of(kind) != calls_of(CoreController):
         obstacle = "has calls of its own"
-    elif controller._opened().algorithm.path is not None:
-        obstacle = "has an algorithm of its own"
     else:
         return controller._opened()
     named = f"{getattr(controller, 'name', kind.__name__)} ({kind.__name__})"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._types import NumberOrArray
-from ..core.block import reason_of
+from ..core.block import REASONS
 from .c99 import exportable
 from .precision import in_precision
 
@@ -75,4 +75,4 @@ class Float32Controller:
     def _require(self, answer: int) -> None:
         if answer:
             limits = "in float32: 1e6 for 1e25 and 1e50, 1e12 for 1e100"
-            raise ValueError(f"{reason_of(answer)} ({limits}); nothing was changed")
+            raise ValueError(f"{REASONS[answer]} ({limits}); nothing was changed")

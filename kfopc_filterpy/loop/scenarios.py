@@ -14,7 +14,7 @@ from .._validate import as_positive, as_signal
 from ..controllers.core_controller import RECORDED as IN_CONSTRAINT
 from ..controllers.core_controller import CoreController
 from ..controllers.power_budget import PowerBudgetController
-from ..core.block import Block, Shape, reason_of
+from ..core.block import REASONS, Block, Shape
 from ..core.run_loop import DIVERGED, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals, Steps
 from ..paths.models import is_system, path_taps, stacked
 from ..power.amplifiers import Amplifier, compiled_model
@@ -208,10 +208,6 @@ def _blocks_that_share(controllers: list[Any], fs: float) -> list[Block]:
             raise ValueError(
                 f"controllers[{i}], {controller.name}, learns the plant, which differs from scenario to scenario: use simulate"
             )
-        if looped.owner.algorithm.path is not None:
-            raise ValueError(
-                f"controllers[{i}] has an algorithm of your own, which may know one scenario only: use simulate"
-            )
         blocks.append(looped.owner)
     for i, block in enumerate(blocks[1:], 1):
         difference = _difference(blocks[0], block)
@@ -222,7 +218,7 @@ def _blocks_that_share(controllers: list[Any], fs: float) -> list[Block]:
 
 def _difference(one: Block, other: Block) -> str | None:
     """Return what prevents two blocks from sharing gains, in words; None if nothing does."""
-    if (one.algorithm.name, one.algorithm.path) != (other.algorithm.name, other.algorithm.path):
+    if one.algorithm.name != other.algorithm.name:
         return "the algorithm"
     for name, words in SHAPE_IN_WORDS.items():
         if getattr(one.shape, name) != getattr(other.shape, name):
@@ -307,10 +303,10 @@ class _SideBySide:
         where = f"sample {sample} of the run"
         if status == REFUSED_REFERENCE:
             self._block.reference[:] = plant.reference
-            raise ValueError(f"{reason_of(self._block.emit())} ({where})")
+            raise ValueError(f"{REASONS[self._block.emit()]} ({where})")
         self._block.error[:] = plant.error
         loudest = int(np.argmax(np.abs(plant.error)))
-        raise ValueError(f"{reason_of(self._block.update())} ({where}, the loudest error is controllers[{loudest}]'s)")
+        raise ValueError(f"{REASONS[self._block.update()]} ({where}, the loudest error is controllers[{loudest}]'s)")
 
     def give_back(self) -> None:
         """Write the present state into the blocks of the controllers."""

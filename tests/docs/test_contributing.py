@@ -85,11 +85,10 @@ from kfopc_filterpy import OutputLimiter, noise_reduction_db, simulate
 from kfopc_filterpy.bench import Runs, make_controller, make_scene, registry, tune
 from kfopc_filterpy.controllers import CoreController
 from kfopc_filterpy.plot import curve_style, style
-
-{imported}
+from kfopc_filterpy.controllers.sign import SignFxLMS
 
 x, s = np.random.default_rng(1).standard_normal(3000), np.array([0.0, 0.8, -0.3])
-plant = {{"primary_path": [0.0, 0.0, 1.0, 0.5], "secondary_path": s, "sensor_noise_std": 0.01, "rng": 2}}
+plant = {"primary_path": [0.0, 0.0, 1.0, 0.5], "secondary_path": s, "sensor_noise_std": 0.01, "rng": 2}
 controllers = [SignFxLMS(8, s, step_size=0.002) for _ in range(2)]
 assert isinstance(controllers[0], CoreController)
 fast, slow = (
@@ -114,9 +113,6 @@ many = SignFxLMS(8, np.array([[s, 0 * s], [s, 0 * s]]), step_size=0.001)
 both = simulate(many, x, secondary_path=np.array([[s, 0 * s], [s, 0 * s]]), disturbance=np.array([d, d]))
 np.testing.assert_allclose(both.error, [e, e], rtol=1e-9, atol=1e-9)
 np.testing.assert_array_equal(many.weights[1], 0.0)
-
-{more}
-print("fine")
 """
 
 STUDIES = """
@@ -138,39 +134,25 @@ assert "sign FxLMS" in registry.algorithms(several_channels=True)
 
 SECTION = TEXT.split("<!-- add-a-controller")[1].split("## Build the core")[0]
 SIGN, MEAN = re.findall(r"^```c\n(.*?)^```", SECTION, flags=re.M | re.S)
-CLASS, REGISTERED, STYLED, OUTSIDE = re.findall(r"^```python\n(.*?)^```", SECTION, flags=re.M | re.S)
+CLASS, REGISTERED, STYLED = re.findall(r"^```python\n(.*?)^```", SECTION, flags=re.M | re.S)
 
 
-def check(folder: Path, package: Path, *, imported: str, more: str = "") -> None:
-    """Run `CHECK` in a folder, in a process of its own, with caches of its own."""
-    (folder / "check.py").write_text(CHECK.format(imported=imported, more=more), encoding="utf-8")
-    environment = os.environ | {
-        "KFOPC_CACHE": str(folder / "cache"),
-        "PYTHONPATH": os.pathsep.join([str(package), str(ROOT / "tests")]),
-    }
-    command = [sys.executable, "-W", "error", "check.py"]
-    done = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert done.stdout.split() == ["fine"], done.stderr
-
-
-def test_the_algorithm_that_it_adds_to_the_package_runs_and_is_tuned(tmp_path):
+@pytest.mark.parametrize("state", ["", MEAN], ids=["", "with a state of its own"])
+def test_the_algorithm_that_it_adds_to_the_package_runs_and_is_tuned(tmp_path, state):
     """In a copy of the package, whose core is compiled with the new file."""
     package = tmp_path / "copy" / "kfopc_filterpy"
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__", "libanc-*"))
-    (package / "core" / "sign.c").write_text(SIGN, encoding="utf-8")
+    with_state = SIGN.replace("static int update(", f"{state}\nstatic int update(").replace("layout_plain", "layout")
+    (package / "core" / "sign.c").write_text(with_state if state else SIGN, encoding="utf-8")
     (package / "controllers" / "sign.py").write_text(CLASS, encoding="utf-8")
     build = "from building import *; build(core_sources(), FOLDER / library_name('double', LEVELS[0]))"
     subprocess.run([sys.executable, "-c", build], cwd=package / "core", check=True)
     names = f"REGISTERED, STYLED = {REGISTERED.strip()!r}, {STYLED.strip()!r}\n"
-    imported = "from kfopc_filterpy.controllers.sign import SignFxLMS"
-    check(tmp_path, package.parent, imported=imported, more=names + STUDIES)
-
-
-@pytest.mark.parametrize("state", ["", MEAN], ids=["", "with a state of its own"])
-def test_its_file_runs_outside_the_package(tmp_path, state):
-    own = SIGN.replace("static int update(", f"{state}\nstatic int update(").replace("layout_plain", "layout")
-    (tmp_path / "sign.c").write_text(own if state else SIGN, encoding="utf-8")
     more = "assert many._opened().fields['mean_error'].shape == (1, 1, 1, 2)" if state else ""
-    check(tmp_path, PACKAGE.parent, imported=OUTSIDE, more=more)
+    (tmp_path / "check.py").write_text(CHECK + names + STUDIES + more + '\nprint("fine")\n', encoding="utf-8")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(package.parent), str(ROOT / "tests")])}
+    command = [sys.executable, "-W", "error", "check.py"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.stdout.split() == ["fine"], done.stderr
