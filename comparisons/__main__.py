@@ -10,7 +10,9 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-from kfopc_filterpy.bench import Runs, StudyReport, prepare_folder, results_table, write_report
+from kfopc_filterpy._writing import prepare_folder
+
+from .bench import Runs, StudyReport, results_table, write_report
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
 

@@ -11,11 +11,13 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+import numpy as np
 
 ABANDONED_S = 3600.0  # what is unfinished and as old as this belongs to a process that was killed
 
@@ -100,6 +102,49 @@ def require_writable(folder: str | os.PathLike[str]) -> None:
     """Raise OSError if no file can be written in a folder."""
     with tempfile.TemporaryFile(dir=folder):
         pass
+
+
+def prepare_folder(folder: str | os.PathLike[str]) -> Path:
+    """Return a folder, made unless it is there, after a check that it can be written: better before a run than after.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be made or written.
+    """
+    try:
+        path = made_folder(folder)
+        require_writable(path)
+    except OSError as error:
+        raise OSError(f"folder {str(folder)!r} cannot be written ({error}); choose another output folder") from error
+    return path
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file in UTF-8, whole or not at all."""
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def jsonable(value: object, where: str = "value") -> Any:
+    """Return `value` in strict JSON's types: arrays as lists, numpy's scalars as numbers, NaN and Inf as None.
+
+    Examples
+    --------
+    >>> jsonable({"power": np.float64(0.8), "taps": np.array([1.0, np.nan])})
+    {'power': 0.8, 'taps': [1.0, None]}
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item, f"{where}, {key!r}") for key, item in value.items()}
+    if isinstance(value, list | tuple | range):
+        return [jsonable(item, where) for item in value]
+    raise TypeError(f"{where} must hold numbers, text, arrays, lists or mappings, got {type(value).__name__}")
 
 
 def _move(path: Path, to: Path) -> None:

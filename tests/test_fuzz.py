@@ -214,7 +214,7 @@ def test_a_filter_refuses_and_stays_or_is_finite() -> None:
 
 
 WORDS = [
-    *("verdict", "compare", "paths", "identify", "inspect", "convert", "resample", "run", "data", "list", "where"),
+    *("verdict", "paths", "identify", "inspect", "convert", "resample", "run", "data", "list", "where"),
     *(
         "noise.wav",
         "P.wav",
@@ -242,7 +242,6 @@ COMMANDS = [
     ["paths", "identify", "noise.wav", "d.wav", "--taps", "16", "-o", "S4.wav"],
     ["data", "list", "--json"],
     ["verdict", *SCENE, "--ohm", "8", "--want-db", "nan"],
-    ["compare", *SCENE, "--algorithm", "none"],
     ["run", *SCENE, "--seconds", "nan"],
 ]
 
@@ -267,7 +266,7 @@ def test_a_wrong_command_is_told_in_one_line(folder: Path, capsys: pytest.Captur
         for _ in range(rng.integers(1, 3)):
             place = int(rng.integers(1, len(arguments) + 1))
             word = WORDS[rng.integers(len(WORDS))]
-            if word in ("verdict", "compare", "run"):
+            if word in ("verdict", "run"):
                 continue  # a whole run takes longer than all the wrong ones
             arguments[place : place + int(rng.integers(0, 2))] = [word]
         try:

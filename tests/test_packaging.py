@@ -28,7 +28,7 @@ README_COMMANDS = [
 ]
 # Extras and groups that the tests run without.
 NOT_FOR_TESTS = ("bench", "benchmark", "docs", "fmu", "realtime", "coverage", "dev", "lint", "mutants")
-LOADED_WHEN_FIRST_USED = ("control", "h5py", "matplotlib", "pooch", "pyuff", "soundfile", "tqdm")
+LOADED_WHEN_FIRST_USED = ("jinja2", "control", "h5py", "matplotlib", "pooch", "pyuff", "soundfile", "tqdm")
 
 
 def read(name: str) -> str:
@@ -75,7 +75,7 @@ PARTS = [
     "export",
     "realtime",
     "plot",
-    "bench",
+    "verdict",
 ]
 
 
@@ -90,6 +90,13 @@ def test_public_names_resolve_and_are_listed_once(namespace):
         assert name in dir(module)
         hides = Path(module.__file__).with_name(f"{name}.py").exists() and not inspect.ismodule(thing)
         assert not hides, f"importing {name}.py would put the module in place of the name"
+
+
+def test_the_package_never_imports_the_comparisons_and_its_wheel_has_none_of_them():
+    wheel = tomllib.loads(read("pyproject.toml"))["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert wheel["packages"] == ["kfopc_filterpy"]
+    for path in (ROOT / "kfopc_filterpy").rglob("*.py"):
+        assert not re.search(r"\bcomparisons\b", path.read_text(encoding="utf-8")), path
 
 
 def test_package_is_typed():

@@ -15,8 +15,8 @@ import pytest
 from helpers.commands import FS, ROOT, SCENE
 from matplotlib.figure import Figure
 
+from comparisons.bench import Sound, StudyReport, write_report
 from kfopc_filterpy import FxLMS, _writing
-from kfopc_filterpy.bench import Sound, StudyReport, write_report
 from kfopc_filterpy.commands import main
 from kfopc_filterpy.export import export_c
 from kfopc_filterpy.plot import save_figure

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy.bench import Algorithm, algorithms
 from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.controllers import SubfilterKalman, band_subfilters
 from kfopc_filterpy.controllers.channel_samples import ChannelFilters
 
+from ..bench import Algorithm, algorithms
 from .blocks import PlaysBlocks
 from .tasks import Task
 

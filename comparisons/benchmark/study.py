@@ -15,20 +15,12 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, __version__, noise_reduction_db, nse_db, output_power
-from kfopc_filterpy.bench import (
-    Algorithm,
-    AllDivergedError,
-    Runs,
-    make_controller,
-    prepare_folder,
-    run_setting,
-    tune,
-    write_whole,
-)
-from kfopc_filterpy.bench.registry import registered
-from kfopc_filterpy.bench.scene import one_blas_thread
-from kfopc_filterpy.bench.tuning import BUDGET
+from kfopc_filterpy._writing import prepare_folder, write_whole
+from kfopc_filterpy.verdict.runs import one_blas_thread
 
+from ..bench import Algorithm, AllDivergedError, Runs, make_controller, run_setting, tune
+from ..bench.registry import registered
+from ..bench.tuning import BUDGET
 from .blocks import CommandController, EntryFailed
 from .entries import entries_for, own_entries, peers
 from .tasks import FOLDER, JUDGED, LeftOut, Task, read_task

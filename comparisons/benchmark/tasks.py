@@ -20,12 +20,12 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult, bandpass_path, power_constrained_wiener
 from kfopc_filterpy._validate import as_choice
-from kfopc_filterpy.bench import Scene, make_scene
-from kfopc_filterpy.bench.scene import reachable_weights
 from kfopc_filterpy.controllers import Controller, CoreController
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.signals import band_limited_noise, compressor_noise, looped, tone
 
+from ..bench import Scene, make_scene
+from ..bench.scene import reachable_weights
 from ..studies.cases import Pair, measured_data, of_unit_gain
 from ..studies.multichannel_rooms import built_in_room
 

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kfopc_filterpy import KFOPC
-from kfopc_filterpy._writing import replacing
-from kfopc_filterpy.bench import write_whole
+from kfopc_filterpy._writing import replacing, write_whole
 
 from ..studies.report_parts import new_figure
 from . import variants

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier, bench, noise_reduction_db, output_power
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
+from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier, noise_reduction_db, output_power
 from kfopc_filterpy.metrics import coherence_and_gain, harmonics_db
 from kfopc_filterpy.plot import curve_style
 
+from .. import bench
+from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
 from . import cases
 from . import report_parts as parts
 from .cases import BAND_HZ, FS, TONE_HZ, Case, Pair, Setting

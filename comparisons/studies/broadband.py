@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, bandpass_path, bench, output_power
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, figures_of_merit
+from kfopc_filterpy import SimulationResult, bandpass_path, output_power
 from kfopc_filterpy.metrics import coherence_and_gain
 from kfopc_filterpy.plot import plot_disturbance_and_anti_noise, plot_error_spectra, plot_nse
 from kfopc_filterpy.signals import band_limited_noise
 
+from .. import bench
+from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, figures_of_merit
 from . import report_parts as parts
 from .broadband_clipped import clipped_claim, run_clipped, starts
 from .cases import FS, PAPER, Results, grid_runs, run_seeds

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power
-from kfopc_filterpy.bench import Claim, Runs, Scene, Tuned
 from kfopc_filterpy.metrics import peak_control_signal
 
+from ..bench import Claim, Runs, Scene, Tuned
 from .cases import Results, run_seeds
 from .report_parts import first_second_db
 from .rows import span

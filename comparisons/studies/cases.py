@@ -12,13 +12,14 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult, bandpass_path, power_constrained_wiener, signals
 from kfopc_filterpy._types import ChangingPaths
-from kfopc_filterpy.bench import Runs, Scene, Tuned, algorithms, make_controller, make_scene, run_settings
-from kfopc_filterpy.bench.scene import louder, reachable_weights
-from kfopc_filterpy.bench.tuning import best_setting, try_settings
 from kfopc_filterpy.bounds import PowerConstrainedWiener
 from kfopc_filterpy.loop.inputs import disturbance_at_microphone, noise_gain
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.signals import MeasuredDuct, MeasuredRoom
+
+from ..bench import Runs, Scene, Tuned, algorithms, make_controller, make_scene, run_settings
+from ..bench.scene import louder, reachable_weights
+from ..bench.tuning import best_setting, try_settings
 
 FS = 16000.0
 SWITCH_ON_S = 0.5

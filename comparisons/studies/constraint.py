@@ -8,11 +8,12 @@ from itertools import chain, product
 
 import numpy as np
 
-from kfopc_filterpy import bench, convergence_time_s
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned
+from kfopc_filterpy import convergence_time_s
 from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
 from kfopc_filterpy.plot import curve_style
 
+from .. import bench
+from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned
 from . import cases
 from . import report_parts as parts
 from .cases import FS, SWITCH_ON_S, WINDOW_S, Case, noises, paths

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import HardClipAmplifier, OutputLimiter
-from kfopc_filterpy.bench import Scene, Table, Tuned, make_controller
 from kfopc_filterpy.paths import path_taps, perturbed_path
 
+from ..bench import Scene, Table, Tuned, make_controller
 from .cases import FS, WINDOW_S, Case, changing
 from .rows import WindowRow, cell, figures_of
 

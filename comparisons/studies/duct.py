@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, bench, noise_reduction_db, nse_db, output_power
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table
+from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db, output_power
 from kfopc_filterpy.bounds import power_constrained_solution, wiener_solution
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import duct_paths, fir_path, secondary_path_gain
 from kfopc_filterpy.plot import plot_constraint_factor, plot_error_spectra, plot_nse, plot_output_power
 from kfopc_filterpy.signals import DataUnavailableError, compressor_noise, load_measured_duct
 
+from .. import bench
+from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table
 from . import report_parts as parts
 from .cases import FS, PAPER, SEED, grid_runs, of_unit_gain, run_each
 from .duct_start import Start, faster_claim, start_under_constraint

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db
-from kfopc_filterpy.bench import Claim, Scene, Tuned, make_controller
 
+from ..bench import Claim, Scene, Tuned, make_controller
 from .cases import FS
 from .report_parts import first_second_db, milliseconds
 

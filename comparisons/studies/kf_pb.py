@@ -11,10 +11,10 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from kfopc_filterpy import MOVFxLMS
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, StudyReport, Table
 from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
 from kfopc_filterpy.metrics import overshoot
 
+from ..bench import Claim, FigureItem, Parameter, Runs, StudyReport, Table
 from . import kf_pb_cases as cases
 from .cases import FS, SENSOR_NOISE_DB, Pair
 from .kf_pb_cases import CHANGING, FAULTS, STEADY, Rated, make_rated

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from kfopc_filterpy import kf_pb, noise_reduction_db, power_constrained_wiener, simulate
-from kfopc_filterpy.bench.scene import reachable_weights
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.signals import level_jump, looped
 
+from ..bench.scene import reachable_weights
 from .cases import FS, SENSOR_NOISE_DB, Pair, made_noises, measured_room, paths, recordings
 
 N_TAPS = 256

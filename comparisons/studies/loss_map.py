@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 
 from kfopc_filterpy import OutputLimiter
-from kfopc_filterpy.bench import FigureItem, Parameter, Runs, StudyReport, Table
 
+from ..bench import FigureItem, Parameter, Runs, StudyReport, Table
 from . import kf_pb_cases as cases
 from .cases import FS, SENSOR_NOISE_DB, Pair
 from .kf_pb_cases import FAULTS, STEADY, fixed_filters, make_rated, with_any_power

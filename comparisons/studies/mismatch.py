@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import bench
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
 
+from .. import bench
+from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
 from . import report_parts as parts
 from .cases import BAND_HZ, FS, Case, Pair, driven_case, ducts, grid_runs, grids, noise_of
 from .rows import Row, column, figure_table, select, worst

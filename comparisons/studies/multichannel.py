@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, bench, noise_reduction_db, output_power
+from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power
 from kfopc_filterpy._validate import how_to_install
-from kfopc_filterpy.bench import FigureItem, Parameter, Runs, Scene, Sound, StudyReport, Table, Tuned, algorithms
 from kfopc_filterpy.plot import curve_style, plot_nse
 
+from .. import bench
+from ..bench import FigureItem, Parameter, Runs, Scene, Sound, StudyReport, Table, Tuned, algorithms
 from . import multichannel_rooms as rooms
 from . import report_parts as parts
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Setting, bound_of, run_seeds

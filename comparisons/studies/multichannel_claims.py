@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kfopc_filterpy.bench import Claim, Tuned, algorithms
-
+from ..bench import Claim, Tuned, algorithms
 from .multichannel_rooms import RECORDINGS
 from .rows import Row, loss_claim, select, worst
 

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from kfopc_filterpy import SimulationResult, signals
-from kfopc_filterpy.bench import FigureItem, Scene
 from kfopc_filterpy.paths import RoomPaths, horizontal_plane, room_paths
 
+from ..bench import FigureItem, Scene
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of, measured_room, recordings, unit_scene
 from .report_parts import new_figure
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, bench
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
+from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.plot import curve_style
 
+from .. import bench
+from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
 from . import report_parts as parts
 from .cases import SWITCH_ON_S, Case, bounds_db, grid_runs, make_case, noises, paths
 from .rows import WindowRow, column, figures_of, grouped, loss_claim, span, worst

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db
-from kfopc_filterpy.bench import FigureItem, Parameter, Scene, Sound, StudyReport, Trial, Tuned, algorithms
 from kfopc_filterpy.bounds import power_constrained_solution
 from kfopc_filterpy.plot import curve_style, plot_bode
 
+from ..bench import FigureItem, Parameter, Scene, Sound, StudyReport, Trial, Tuned, algorithms
 from .cases import BAND_HZ, FS, N_TAPS, SEED, SENSOR_NOISE_DB, SWITCH_ON_S, TONE_HZ, bounds_db
 
 MARK = "0.35"  # colour of reference lines

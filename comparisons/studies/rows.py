@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power
-from kfopc_filterpy.bench import Claim, Table
 from kfopc_filterpy.metrics import overshoot
 
+from ..bench import Claim, Table
 from .cases import FS, WINDOW_S, Case
 
 AnyRow = TypeVar("AnyRow")

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, SimulationResult, bandpass_path, bench, plot
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, algorithms
+from kfopc_filterpy import HardClipAmplifier, SimulationResult, bandpass_path, plot
 from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.metrics import harmonics_db, noise_reduction_db, output_power, peak_control_signal
 from kfopc_filterpy.signals import tone
 
+from .. import bench
+from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, algorithms
 from . import report_parts as parts
 from .cases import FS, PAPER, Setting, grid_runs, run_each
 from .weight_growth import Growth, growth_of

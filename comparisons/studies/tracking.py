@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import convergence_time_s, noise_reduction_db, nse_db, output_power
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
 from kfopc_filterpy.metrics import overshoot, short_time_power
 
+from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
 from . import cases
 from . import report_parts as parts
 from . import tracking_events as events

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kfopc_filterpy.bench import Scene
 from kfopc_filterpy.paths import Duct, duct_paths, path_taps
 
+from ..bench import Scene
 from .cases import FS, SEED, SWITCH_ON_S, Pair, changing, driven_case, noise_of
 
 OVERDRIVE_DB = 3.0

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
 from kfopc_filterpy.controllers.posterior import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance, identify_secondary_path, path_taps, perturbed_path
 from kfopc_filterpy.signals import band_limited_noise, tone
 
+from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
 from . import cases
 from . import report_parts as parts
 from .cases import FS, SEED, SENSOR_NOISE_DB, SWITCH_ON_S, Noise, Pair, noises, paths

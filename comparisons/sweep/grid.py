@@ -12,8 +12,8 @@ import numpy as np
 
 from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier
 from kfopc_filterpy._validate import as_count, as_number, as_positive
-from kfopc_filterpy.bench import algorithms
 
+from ..bench import algorithms
 from ..studies.cases import made_noises, measured_data, modelled_paths
 
 AMPLIFIERS: dict[str, Callable[[float], Any]] = {  # of the amplitude limit

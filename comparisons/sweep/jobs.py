@@ -12,7 +12,7 @@ from typing import Any
 import joblib
 
 from kfopc_filterpy._validate import as_count
-from kfopc_filterpy.bench.scene import one_blas_thread
+from kfopc_filterpy.verdict.runs import one_blas_thread
 
 from .grid import Values
 from .scenario import Figures, group_of, most_together, naming, run_group

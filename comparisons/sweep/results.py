@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import t as student
 
-from kfopc_filterpy._writing import replacing
-from kfopc_filterpy.bench import write_whole
+from kfopc_filterpy._writing import replacing, write_whole
 from kfopc_filterpy.plot import curve_style
 
 from ..studies.report_parts import MARK, new_figure

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, clipped_fraction, convergence_time_s, noise_reduction_db, output_power
-from kfopc_filterpy.bench import AllDivergedError, Runs, Scene, algorithms, make_controller, run_setting, tune
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot.style import decibels
 
+from ..bench import AllDivergedError, Runs, Scene, algorithms, make_controller, run_setting, tune
 from ..studies import cases
 from ..studies.cases import FS, SWITCH_ON_S, WINDOW_S, Pair, Setting
 from .grid import AMPLIFIERS, DEFAULT_SETTING, TUNED_SETTING, Values

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import kfopc_filterpy
-from kfopc_filterpy.bench import prepare_folder, write_whole
+from kfopc_filterpy._writing import prepare_folder, write_whole
 
 from .grid import Grid
 from .scenario import Figures

@@ -25,7 +25,7 @@ NAMESPACES = (
     "export",
     "realtime",
     "plot",
-    "bench",
+    "verdict",
 )
 
 TASKS = {  # what the names of a folder are for
@@ -38,7 +38,7 @@ TASKS = {  # what the names of a folder are for
     "plot": "Draw figures",
     "signals": "Read recordings, make noises",
     "paths": "Model, measure and judge paths",
-    "bench": "Rate an amplifier, compare and tune algorithms",
+    "verdict": "Rate an amplifier",
     "realtime": "Run in real time",
     "export": "Take a controller to a board",
 }

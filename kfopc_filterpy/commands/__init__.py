@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from .. import __version__
-from . import compare, data, demo, export, paths, run, verdict
+from . import data, demo, export, paths, run, verdict
 from .options import WRONG_INPUT, Parser
 
 PIPE_CLOSED = 141  # as of a program that SIGPIPE ends
@@ -17,7 +17,6 @@ PIPE_CLOSED = 141  # as of a program that SIGPIPE ends
 EXAMPLES = """examples:
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --volts-per-unit 10 --want-db 6 -o out
   kfopc paths identify sent.wav received.wav --taps 512 -o S.wav
-  kfopc compare noise.wav --primary P.wav --secondary S.wav --rated-power 1.6 --algorithm KF-PB,FxLMS -o out
   kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --seconds 20
   kfopc export controller.toml -o firmware --dtype float32
   kfopc data list
@@ -68,6 +67,6 @@ def whole_parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"kfopc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in (verdict, compare, paths, run, export, data, demo):
+    for module in (verdict, paths, run, export, data, demo):
         module.add_to(commands)
     return parser

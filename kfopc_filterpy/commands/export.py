@@ -20,7 +20,7 @@ EXAMPLES = """examples:
   kfopc export controller.toml -o simulation --fmu
 
 controller.toml, where every other key is a keyword argument of the algorithm in Python:
-  algorithm = "KF-OPC"         # a name that kfopc compare knows, or "fast-array KF"
+  algorithm = "KF-OPC"         # a name of the table in docs/algorithms.md
   n_taps = 64
   secondary_path = "S.wav"     # or taps, or a list of files, one for each loudspeaker
   fs = 16000                   # resample the path to this rate (default: the rate of the file)
@@ -68,9 +68,9 @@ def export(options: argparse.Namespace) -> int:
 
 def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | None]:
     """Return the controller that a settings file describes, and its sample rate, None if nothing states it."""
-    from .. import FastArrayKalman, OutputLimiter, OutputPowerConstraint
-    from ..bench import algorithms
+    from .. import OutputLimiter, OutputPowerConstraint
     from ..controllers.base import constraint_for
+    from ..controllers.table import CORE
     from ..paths import PathTolerance
     from ..signals.content import require_file
 
@@ -79,9 +79,7 @@ def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | Non
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path} is not TOML: {error}") from error
-    makers: dict[str, Any] = {name: own.make for name, own in algorithms().items() if own.in_core}
-    makers[FastArrayKalman.name] = FastArrayKalman
-    make = makers[as_choice(settings.pop("algorithm", None), f"algorithm in {path}", makers)]
+    make = CORE[as_choice(settings.pop("algorithm", None), f"algorithm in {path}", CORE)]
     given_fs = settings.pop("fs", None)
     files = Files(argparse.Namespace(**vars(options) | {"fs": options.fs or given_fs}))
     if "secondary_path" in settings:

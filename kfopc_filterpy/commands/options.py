@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
 from .._validate import as_count, as_positive
+from .._writing import prepare_folder
 
 DONE, WRONG_INPUT = 0, 2
 
@@ -128,15 +129,11 @@ def add_recorded_scene(parser: argparse._ActionsContainer) -> None:
 
 
 def prepare_output(options: argparse.Namespace) -> None:
-    """Raise an error if the folder, or the page in it, cannot be written: better before the run than after it."""
+    """Raise an error if the folder cannot be written: better before the run than after it."""
     import matplotlib
-
-    from ..bench.assessment_page import require_page
-    from ..bench.report import prepare_folder
 
     matplotlib.use("Agg")
     if options.output is not None:
-        require_page()
         prepare_folder(options.output)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .._writing import replacing, require_writable
+from .._writing import jsonable, replacing, require_writable
 from .inputs import Files
 from .options import DONE, Parser, add_command, add_count, add_reading, sentence
 from .printing import warn
@@ -130,8 +130,6 @@ def inspect(options: argparse.Namespace) -> int:
     if primary is not None:
         facts["causality_margin_s"] = causality_margin(primary, paths, fs=fs).margin_s
     if options.json:
-        from ..bench.study_report import jsonable
-
         print(json.dumps(jsonable(facts), allow_nan=False))
         return DONE
     for one in each:

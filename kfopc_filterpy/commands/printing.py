@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .._validate import optional_module
-
 
 def warn(options: argparse.Namespace, message: str, kind: str = "warning") -> None:
     """Print a warning or a note to standard error, in one line."""
@@ -33,7 +31,8 @@ def say_written(options: argparse.Namespace, page: Path, beside: str) -> None:
 @contextmanager
 def progress_bar(options: argparse.Namespace, unit: str) -> Iterator[Any]:
     """Yield a progress bar, which is shown on a terminal only."""
-    tqdm = optional_module("tqdm", "studies", "the progress bar")
+    import tqdm
+
     quiet = True if options.quiet else None
     with tqdm.tqdm(unit=unit, unit_scale=True, disable=quiet, dynamic_ncols=True, leave=False) as bar:
         yield bar

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 
 from .._validate import as_nonnegative
+from .._writing import jsonable
 from .inputs import Files, scene_of
 from .options import DONE, Parser, add_command, add_count, add_number, add_scene, refuse_unused
 from .printing import warn
@@ -212,8 +213,6 @@ def _powers(report: RunStatus | RunReport, of: str = "") -> str:
 
 def _facts(report: RunReport) -> str:
     """Return a report as JSON, without the arrays of the path and the controller."""
-    from ..bench.study_report import jsonable
-
     facts = {name: value for name, value in vars(report).items() if name not in ("secondary_path", "controller")}
     return json.dumps(jsonable(facts | {"health": [vars(event) for event in report.health.events]}), indent=2)
 

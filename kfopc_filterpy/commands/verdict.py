@@ -68,9 +68,9 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
 
 def verdict(options: argparse.Namespace) -> int:
     """Print a verdict, and write its page if a folder is given."""
-    from ..bench import assess
-    from ..bench.assessed_runs import ALGORITHMS
-    from ..bench.assessment import advice_on
+    from ..verdict import assess
+    from ..verdict.assessment import advice_on
+    from ..verdict.runs import ALGORITHMS
 
     if options.output is not None:
         prepare_output(options)

@@ -52,7 +52,7 @@ def curve_style(curve: str | int) -> dict[str, Any]:
     Parameters
     ----------
     curve : str or int
-        Name of an algorithm, as in ``kfopc_filterpy.bench.algorithms()``, or the number of the curve, from 0. The numbers
+        Name of an algorithm, such as "KF-OPC", or the number of the curve, from 0. The numbers
         repeat six colours and four line styles. An algorithm without a style of its own is drawn black and dotted.
 
     Returns

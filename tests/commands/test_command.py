@@ -42,7 +42,7 @@ ERRORS = {
     "verdict noise.wav PATHS --rated-power 1 --ohm 8 --x-max-mm 1": "--x-max-mm and --displacement must be",
     "verdict noise.wav PATHS --ohm 8 --loudspeaker-watt 1 --programme-watt 2": "leave out one of them",
     "verdict noise.wav PATHS --ohm 8 --loudspeaker-watt 1 --impedance falling.csv": "of falling.csv must",
-    "compare noise.wav PATHS --rated-power 1 --ohm -1": "--ohm must be greater than 0",
+    "verdict noise.wav PATHS --rated-power 1 --ohm -1": "--ohm must be greater than 0",
     # The option that an argument of the package comes from is named.
     "verdict noise.wav PATHS --rated-power 1 --algorithm KF": "--algorithm must be one of 'KF-PB'",
     "verdict noise.wav PATHS --rated-power 1 --want-db -3": "--want-db must not be negative",
@@ -109,19 +109,9 @@ def test_a_path_of_far_too_many_taps_is_refused_before_anything_runs(command, fo
     )
 
 
-@pytest.mark.parametrize("name", ["jinja2", "PIL", "tqdm"])
-def test_a_missing_library_is_named_with_its_extra_before_anything_runs(command, uninstall, name, tmp_path):
-    uninstall(name)
-    code, _, err = command("verdict", *SCENE, "--rated-power", "1", "-o", tmp_path / "out")
-    assert code == 2
-    assert name in err
-    assert "extra `studies`" in err
-    assert not list((tmp_path / "out").glob("*"))
-
-
 @pytest.mark.parametrize(
     "arguments",
-    [[], ["verdict"], ["compare"], ["paths"], ["paths", "identify"]],
+    [[], ["verdict"], ["paths"], ["paths", "identify"]],
 )
 def test_help_says_what_it_does_and_shows_an_example(command, arguments):
     code, out, _ = command(*arguments, "--help")

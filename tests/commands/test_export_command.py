@@ -10,7 +10,6 @@ import pytest
 from helpers.commands import FS
 
 from kfopc_filterpy import (
-    FastArrayKalman,
     FxLMS,
     HardClipAmplifier,
     OutputLimiter,
@@ -20,8 +19,8 @@ from kfopc_filterpy import (
     kf_pb,
     simulate,
 )
-from kfopc_filterpy.bench import algorithms
 from kfopc_filterpy.controllers import VerifiedController
+from kfopc_filterpy.controllers.table import CORE
 from kfopc_filterpy.export import export_c, export_fmu
 from kfopc_filterpy.paths import PathTolerance, read_path
 
@@ -30,7 +29,7 @@ SETTINGS = {
     "KF-OPC": NOISES | {"rated_power": 0.5},
     "KF-PB": {"rated_power": 0.5},
     "FxRLS": {},
-    "MOV-FxLMS by variance": STEP | {"rated_power": 0.5, "penalty_factor": 0.2},
+    "MOV-FxLMS": STEP | {"rated_power": 0.5, "penalty_factor": 0.2},
     "MOV-MFxLMS": STEP | {"rated_power": 0.5},
     "clipping FxLMS": STEP | {"amplitude_limit": 0.8},
     "fast-array KF": {"measurement_noise": 1.0},
@@ -57,8 +56,7 @@ def test_an_algorithm_is_described_by_its_name_and_settings(name, command, folde
     code, out, err = command("export", "c.toml", "-o", tmp_path / "out")
     assert (code, err) == (0, "")
     assert out.startswith("<CExport anc.c: ")
-    make = FastArrayKalman if name == FastArrayKalman.name else algorithms()[name].make
-    assert same_as_of_python(make(8, path, **SETTINGS[name]), tmp_path / "out", tmp_path)
+    assert same_as_of_python(CORE[name](8, path, **SETTINGS[name]), tmp_path / "out", tmp_path)
 
 
 def test_parts_rate_and_several_loudspeakers(command, folder, several, tmp_path):

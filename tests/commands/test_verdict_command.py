@@ -17,14 +17,14 @@ import scipy.io
 import soundfile
 from helpers.commands import FS, ROOT, SCENE, process
 
-from kfopc_filterpy import bench
-from kfopc_filterpy.bench import assess
-from kfopc_filterpy.bench.assessment import SCHEMA
+from kfopc_filterpy import verdict
 from kfopc_filterpy.bounds import predictor_reference, wiener_solution
 from kfopc_filterpy.commands import main
 from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.signals import band_limited_noise, read_recording, write_wav
+from kfopc_filterpy.verdict import assess
+from kfopc_filterpy.verdict.assessment import SCHEMA
 
 
 def test_a_process_ends_with_0_if_the_amplifier_is_enough_and_writes_what_it_says(folder, tmp_path):
@@ -111,7 +111,7 @@ def test_a_path_error_is_the_one_that_is_stated_or_the_default_of_assess(command
         asked.update(settings)
         raise ValueError("enough")
 
-    monkeypatch.setattr(bench, "assess", stop)
+    monkeypatch.setattr(verdict, "assess", stop)
     command("verdict", *SCENE, "--rated-power", 1, *options)
     assert asked["secondary_path_uncertainty"] == expected
     told = " ".join(command("verdict", "--help")[1].split())

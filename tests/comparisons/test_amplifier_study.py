@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from helpers.studies import plain_run, run_study, short_duct, smaller
 
+from comparisons.bench import Claim, make_controller
 from comparisons.studies import amplifier, cases
 from comparisons.studies.amplifier import KNOWN, UNKNOWN, AmplifierRow, saturating, settings_for
 from comparisons.studies.cases import Case
 from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier, noise_reduction_db
-from kfopc_filterpy.bench import Claim, make_controller
 from kfopc_filterpy.metrics import harmonics_db
 
 FS = 16000.0

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from helpers.pages import ROOT
 
+from comparisons.bench import Algorithm, Runs, algorithms, make_controller
+from comparisons.bench.registry import registered
 from comparisons.benchmark import study, tasks
 from comparisons.benchmark.blocks import CommandController, EntryFailed
 from comparisons.benchmark.entries import own_entries, peers
 from comparisons.benchmark.tasks import FOLDER, LeftOut, Task, read_task
 from kfopc_filterpy import FxNLMS
-from kfopc_filterpy.bench import Algorithm, Runs, algorithms, make_controller
-from kfopc_filterpy.bench.registry import registered
 
 PAGE = (ROOT / "docs" / "benchmark.md").read_text(encoding="utf-8")
 PRINTED = (ROOT / "docs" / "benchmark.txt").read_text(encoding="utf-8")

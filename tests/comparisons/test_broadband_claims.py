@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from helpers.results import single_result
 
+from comparisons.bench import make_scene, with_clipping
 from comparisons.studies import broadband
 from comparisons.studies.broadband import FS
 from comparisons.studies.broadband_clipped import KNOWING, UNAWARE
 from comparisons.studies.report_parts import first_second_db
 from comparisons.studies.weight_errors import WEIGHTS_EVERY, first_below_s, settled_after_s, weight_error
-from kfopc_filterpy.bench import make_scene, with_clipping
 
 
 @pytest.mark.parametrize(

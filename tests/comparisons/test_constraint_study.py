@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from helpers.studies import run_study, short_duct, smaller
 
+from comparisons.bench import Scene, StudyReport
 from comparisons.studies import cases, constraint
 from comparisons.studies.cases import Case, make_case
 from comparisons.studies.constraint import LIMITED, ClippedRow, ConstraintRow
 from comparisons.studies.rows import cell
-from kfopc_filterpy.bench import Scene, StudyReport
 from kfopc_filterpy.paths import duct_paths, path_taps
 
 TAPS = 16

@@ -11,10 +11,10 @@ import pytest
 from helpers.studies import smaller
 
 from comparisons.__main__ import FURTHER, STUDIES
+from comparisons.bench import Claim, Runs, Tuned, make_controller, make_scene
 from comparisons.studies import duct, duct_start
 from comparisons.studies.duct import Figures
 from comparisons.studies.duct_start import Start
-from kfopc_filterpy.bench import Claim, Runs, Tuned, make_controller, make_scene
 from kfopc_filterpy.signals import band_limited_noise
 
 FS = duct.FS

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from helpers.studies import run_study, smaller
 
+from comparisons.bench import StudyReport
 from comparisons.studies import kf_pb as study
 from comparisons.studies import kf_pb_cases
 from comparisons.studies.cases import FS
 from kfopc_filterpy import kf_pb, noise_reduction_db, simulate
-from kfopc_filterpy.bench import StudyReport
 
 pytestmark = pytest.mark.slow  # the run of the small study takes longest of all, and no other test needs it
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from helpers.studies import run_study, smaller
 
+from comparisons.bench import StudyReport
 from comparisons.studies import kf_pb_cases, loss_map
 from comparisons.studies.cases import SENSOR_NOISE_DB
 from comparisons.studies.kf_pb_cases import Rated, make_rated, noises
-from kfopc_filterpy.bench import StudyReport
 
 TAPS, LONG = 12, 40
 PRIMARY, SECONDARY = np.array([0.0] * 6 + [1.0, 0.5, 0.25]), np.array([0.0, 0.0, 1.0, -0.6, 0.2])

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from helpers.studies import plain_run, run_study, short_duct, smaller
 
+from comparisons.bench import Claim
 from comparisons.studies import cases, mismatch
 from comparisons.studies.cases import Case
 from comparisons.studies.mismatch import EXACT, WRONG, MismatchRow, case_scene
 from kfopc_filterpy import FxLMS, noise_reduction_db, output_power, simulate
-from kfopc_filterpy.bench import Claim
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.signals import tone
 

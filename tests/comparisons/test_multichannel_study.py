@@ -10,12 +10,12 @@ import pytest
 from helpers.channels import through
 from helpers.studies import few_settings, plain_run, run_study, smaller
 
+from comparisons.bench import Runs, algorithms
 from comparisons.studies import multichannel
 from comparisons.studies import multichannel_rooms as rooms
 from comparisons.studies.multichannel import BOUND, KF_PB, SCALED, ChannelRow, claims
 from comparisons.studies.multichannel_rooms import MEASURED, Place, level_map_db
 from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener
-from kfopc_filterpy.bench import Runs, algorithms
 
 KEPT = ("KF-PB", "FxLMS", "MOV-FxLMS", "clipping FxLMS", "leaky FxLMS")
 

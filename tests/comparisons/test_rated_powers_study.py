@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from helpers.studies import few_settings, run_study, short_duct, smaller
 
+from comparisons.bench import StudyReport, run_setting, write_report
+from comparisons.bench import registry as algorithms
 from comparisons.studies import rated_powers
 from comparisons.studies.cases import Case, make_case, noises
 from comparisons.studies.rated_powers import BOUND, RECORD, SCALED, BudgetRow, _claims, mean_rows
 from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener
-from kfopc_filterpy.bench import StudyReport, run_setting, write_report
-from kfopc_filterpy.bench import registry as algorithms
 
 TAPS, DURATION_S = 16, 1.0
 CASE = Case("duct", "band noise")

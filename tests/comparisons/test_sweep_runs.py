@@ -12,6 +12,7 @@ import pytest
 from helpers.studies import plain_run, smaller
 
 from comparisons.__main__ import main
+from comparisons.bench import AllDivergedError, Runs, Scene, algorithms, tune
 from comparisons.studies.cases import FS, SWITCH_ON_S, make_case, measured_data, noises, paths
 from comparisons.sweep import scenario as sweep_scenario
 from comparisons.sweep.grid import built_in_grid
@@ -25,7 +26,6 @@ from kfopc_filterpy import (
     output_power,
     power_constrained_wiener,
 )
-from kfopc_filterpy.bench import AllDivergedError, Runs, Scene, algorithms, tune
 from kfopc_filterpy.paths import path_taps, perturbed_path
 
 SMALL = {"duration_s": 0.5, "n_taps": 24}

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from helpers.results import single_result
 
+from comparisons.bench import Claim
 from comparisons.studies import tonal
 from comparisons.studies.tonal import LIMIT, Growth, growth_of
-from kfopc_filterpy.bench import Claim
 
 HARMONICS, PEAK, POWER, GROWTH, REDUCTION = range(5)  # the claims
 LINE = Growth(over_optimal=600.0, over_half=2.0, of_quarters=1.0)

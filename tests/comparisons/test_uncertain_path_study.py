@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.studies import run_study, smaller
 
+from comparisons.bench import StudyReport
 from comparisons.studies import uncertain_path
 from comparisons.studies.uncertain_path import (
     DEFAULT,
@@ -20,7 +21,6 @@ from comparisons.studies.uncertain_path import (
     seconds_db,
 )
 from kfopc_filterpy import SimulationResult, simulate
-from kfopc_filterpy.bench import StudyReport
 
 PRIMARY, SECONDARY = np.array([0.0] * 8 + [0.8, 0.4]), np.array([0.0, 0.0, 0.0, 1.0, -0.6])
 

@@ -73,7 +73,7 @@ def test_a_folder_imports_only_from_folders_before_it_in_the_list(layer):
 
 def test_the_reader_of_imports_finds_relative_and_public_ones():
     assert set(imported(PACKAGE / "controllers" / "fxlms.py")) == {"_types", "controllers", "power"}
-    assert set(imported(PACKAGE / "bench" / "registry.py")) == {"bench", "controllers", "power"}
+    assert set(imported(PACKAGE / "verdict" / "limits.py")) == {"_types", "loop", "power", "verdict"}
 
 
 # The algorithm.
@@ -82,7 +82,7 @@ CHECK = """
 import numpy as np
 from helpers.comparing import assert_same_run
 from kfopc_filterpy import OutputLimiter, noise_reduction_db, simulate
-from kfopc_filterpy.bench import Runs, make_controller, make_scene, registry, tune
+from comparisons.bench import Runs, make_controller, make_scene, registry, tune
 from kfopc_filterpy.controllers import CoreController
 from kfopc_filterpy.plot import curve_style, style
 from kfopc_filterpy.controllers.sign import SignFxLMS

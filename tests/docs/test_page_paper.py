@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from helpers.pages import Page
 
+from comparisons.bench import figures_of_merit
 from kfopc_filterpy import noise_reduction_db, output_power
-from kfopc_filterpy.bench import figures_of_merit
 from kfopc_filterpy.metrics import harmonics_db
 
 

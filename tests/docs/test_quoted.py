@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kfopc_filterpy.bench import Claim, StudyReport
+from comparisons.bench import Claim, StudyReport
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 sys.path.insert(0, str(DOCS))

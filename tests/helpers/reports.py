@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Sound, StudyReport
+from comparisons.bench import Claim, FigureItem, Parameter, Sound, StudyReport
 
 FS = 8000.0
 D = np.sin(np.arange(400) / 3)

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
+from comparisons.bench import Runs, Scene, StudyReport, make_controller
+from comparisons.bench.registry import REGISTRY
 from comparisons.studies import cases
 from kfopc_filterpy import SimulationResult, simulate
-from kfopc_filterpy.bench import Runs, Scene, StudyReport, make_controller
-from kfopc_filterpy.bench.registry import REGISTRY
 
 
 @contextmanager

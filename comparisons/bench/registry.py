@@ -1,0 +1,351 @@
+"""The algorithms that studies compare: how each is made for a scene, and the settings that are tried to tune it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from kfopc_filterpy import OutputPowerConstraint
+from kfopc_filterpy.controllers import Controller, penalty_factor
+from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
+from kfopc_filterpy.controllers.table import CORE, MAKERS
+from kfopc_filterpy.power.amplifiers import Amplifier
+from kfopc_filterpy.verdict.runs import STEP_SIZES
+
+from .scene import Scene
+
+# r E[x'^2] / q: the filter forgets over about its inverse square root in samples, 0.6 s to 6 ms at 16 kHz. Less state
+# noise makes it recursive least squares that never forgets, which would always be best for stationary noise; the tonal
+# study shows the difference.
+STATE_NOISE_GRID = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
+# The diagonal filter learns as slowly as NLMS, and needs less state noise.
+DIAGONAL_GRID = (1e-12, 1e-11, 1e-10, 1e-9, *STATE_NOISE_GRID)
+FORGETTING_GRID = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
+PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer grid around the best value follows
+BLOCK_STEP_GRID = (0.02, 0.05, 0.1, 0.2, 0.4)  # divided by the power in each bin, so it needs no units
+PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1, 2.0)).tolist())
+
+Setting = float | tuple[float, float]
+Settings = Callable[[Scene, float, float], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """One algorithm of the registry: how it is made and tuned.
+
+    Parameters
+    ----------
+    make : callable
+        Controller's class, or a function that makes one: of the number of taps, the secondary path and keyword arguments.
+    settings : callable
+        Function of a scene, the first setting in the scene's units, and the second setting, which returns these keyword
+        arguments; those that all algorithms share are left out.
+    symbol : str
+        Parameter that the first setting sets: "r", "mu", "mu of a block", "1 - lambda" or
+        "averaging_s".
+    kind : str
+        The first setting as a formula, without units.
+    first : tuple of float
+        Values of the first setting that are tried.
+    second_kind : str, default ""
+        The second setting as a formula, "" if there is none.
+    second : tuple of float, default ()
+        Values of the second setting that are tried.
+    of_paper : bool, default False
+        Whether the paper compares it.
+    keeps_budget : bool, default True
+        Whether it is meant to keep the rated power.
+    sees_budget : bool, default True
+        Whether it is made with the rated power. If not, its runs serve for all rated powers.
+    shares_gains : bool, default False
+        Whether its gain depends on the reference alone, so that several runs on one noise share it.
+    knows_amplifier : bool, default False
+        Whether its disturbance estimate can know the amplifier.
+    may_refuse : bool, default False
+        Whether it may stop during a run because it cannot continue, which counts as divergence.
+    several_channels : bool, default False
+        Whether the studies of several channels compare it; those of one channel compare all.
+    in_core : bool, default True
+        Whether it is in the compiled core, which can be exported.
+    """
+
+    make: Callable[..., Controller]
+    settings: Settings
+    symbol: str
+    kind: str
+    first: tuple[float, ...]
+    second_kind: str = ""
+    second: tuple[float, ...] = ()
+    of_paper: bool = False
+    keeps_budget: bool = True
+    sees_budget: bool = True
+    shares_gains: bool = False
+    knows_amplifier: bool = False
+    may_refuse: bool = False
+    several_channels: bool = False
+    in_core: bool = True
+
+    @property
+    def grid(self) -> list[Setting]:
+        """Settings that are tried: numbers, or pairs if there is a second setting."""
+        if not self.second:
+            return list(self.first)
+        return [(one, two) for one in self.first for two in self.second]
+
+    def finer(self, best: Setting) -> list[Setting]:
+        """Return settings around `best`, the best of the grid; none unless there is a second setting.
+
+        The second setting decides how the budget is spent, so it needs the finer steps.
+        """
+        if not isinstance(best, tuple):
+            return []
+        ratio = self.second[1] / self.second[0]
+        near = [best[1] * ratio ** (k / 6) for k in range(-5, 6) if k]
+        return [(one, two) for one in (best[0] / 2, best[0], 2 * best[0]) for two in near]
+
+    def value(self, scene: Scene, setting: Setting) -> float:
+        """Return the r, mu, 1 - lambda or averaging time in s that a `setting` stands for, in the units of a `scene`."""
+        first = setting[0] if isinstance(setting, tuple) else setting
+        if self.symbol == "r":
+            return first * scene.measurement_noise / scene.filtered_power
+        return first / (scene.n_taps * scene.filtered_power) if self.symbol == "mu" else first
+
+
+def _random_walk(scene: Scene, r: float, _: float) -> dict[str, Any]:
+    return {"state_noise": r, "measurement_noise": scene.measurement_noise, "initial_variance": scene.initial_variance}
+
+
+def _power_budget(scene: Scene, averaging_s: float, _: float) -> dict[str, Any]:
+    return {
+        "rated_power": scene.rated_power,
+        "secondary_path_uncertainty": scene.secondary_path_uncertainty,
+        "fs": scene.fs,
+        "averaging_s": averaging_s,
+    }
+
+
+def _forgetting(scene: Scene, forgotten: float, _: float) -> dict[str, Any]:
+    return {"forgetting": 1.0 - forgotten, "initial_variance": scene.initial_variance / scene.measurement_noise}
+
+
+def _step(scene: Scene, mu: float, _: float) -> dict[str, Any]:
+    return {"step_size": mu}
+
+
+def _normalised(scene: Scene, mu: float, _: float) -> dict[str, Any]:
+    energy = scene.n_taps * scene.filtered_power  # mu compares with FxLMS; the ridge is for the start-up
+    return {"step_size": mu * energy, "regularization": 0.01 * energy}
+
+
+def _leak(scene: Scene, mu: float, price: float) -> dict[str, Any]:
+    return {"step_size": mu, "leak": min(price * scene.filtered_power, 1.0 / mu)}
+
+
+def _penalty(scene: Scene, mu: float, price: float) -> dict[str, Any]:
+    return {"step_size": mu, "penalty_factor": price * scene.secondary_gain}
+
+
+def _penalty_by_variance(scene: Scene, mu: float, _: float) -> dict[str, Any]:
+    """Take the penalty from the variance of the whole disturbance, as the public code of its authors does.
+
+    They use the secondary path's gain for the disturbance, from an inverse model of the path; here the gain is that of
+    eq. 11, as for all algorithms. The penalty hardly depends on it if the noise needs about four times the rated power.
+    """
+    variance = float(np.var(scene.settled[1]))
+    gamma = penalty_factor(scene.rated_power, disturbance_power=variance, secondary_path_gain=scene.secondary_gain)
+    return {"step_size": mu, "penalty_factor": gamma}
+
+
+def _peak(scene: Scene, mu: float, share: float) -> dict[str, Any]:
+    return {"step_size": mu, "amplitude_limit": np.sqrt(share * scene.unconstrained_power)}
+
+
+def _two_gradients(scene: Scene, mu: float, share: float) -> dict[str, Any]:
+    return _peak(scene, mu, share) | {"output_step_size": mu * scene.secondary_gain}
+
+
+def _in_blocks(scene: Scene, mu: float, _: float) -> dict[str, Any]:
+    """Return one partition, for fine bins, of four blocks; in blocks of less than 16 samples, calls would take most time."""
+    block = max(-(-scene.n_taps // 4), 16)
+    return {"step_size": mu, "block_size": block, "partition_size": 4 * block}
+
+
+def _within_power(scene: Scene, mu: float, _: float) -> dict[str, Any]:
+    limits = {"band_edges": (0.0, scene.fs / 2), "band_powers": [scene.rated_power], "fs": scene.fs}
+    return _in_blocks(scene, mu, np.nan) | limits
+
+
+def _within_bands(scene: Scene, mu: float, _: float) -> dict[str, Any]:
+    """Divide the rated power among octaves as the reference divides its own: the control filter's gain has one limit."""
+    settings = _in_blocks(scene, mu, np.nan)
+    octaves = min(int(np.log2((settings["block_size"] + settings["partition_size"]) / 2)), 6)  # none below the bins
+    edges = np.append(0.0, scene.fs / 2 * 2.0 ** np.arange(-octaves, 1))
+    spectrum = np.abs(np.fft.rfft(scene.settled[0])) ** 2
+    bands = np.histogram(np.linspace(0.0, scene.fs / 2, spectrum.size), edges, weights=spectrum)[0]
+    # Less than this cannot be measured beside a loud band, as the window lets some of its power through.
+    shares = np.maximum(bands / bands.sum(), 1e-3)
+    return settings | {"band_edges": edges, "band_powers": scene.rated_power * shares, "fs": scene.fs}
+
+
+def _constrained(settings: Settings) -> Settings:
+    """Return a function that adds the scene's constraint, or one for each loudspeaker, to `settings`."""
+
+    def constrained(scene: Scene, first: float, second: float) -> dict[str, Any]:
+        each = [
+            OutputPowerConstraint(power, fs=scene.fs, memory_s=scene.power_memory_s)
+            for power in np.ravel(scene.rated_power)
+        ]
+        return settings(scene, first, second) | {"constraint": each if np.ndim(scene.rated_power) else each[0]}
+
+    return constrained
+
+
+_RANDOM_WALK: dict[str, Any] = {
+    "symbol": "r",
+    "kind": "r E[x'^2]/q",
+    "first": STATE_NOISE_GRID,
+    "knows_amplifier": True,
+}
+_DIAGONAL = _RANDOM_WALK | {"first": DIAGONAL_GRID}
+_STEP: dict[str, Any] = {"symbol": "mu", "kind": "mu L E[x'^2]", "first": STEP_SIZES}
+_LEAST_FORGOTTEN: dict[str, Any] = {"symbol": "1 - lambda", "kind": "1 - lambda", "first": FORGETTING_GRID}
+_LEAK = _STEP | {"second_kind": "leak over E[x'^2]", "second": PRICE_GRID, "sees_budget": False}
+_PENALTY = _STEP | {"second_kind": "penalty factor over G_s", "second": PRICE_GRID, "sees_budget": False}
+_PEAK = _STEP | {"second_kind": "A^2 over the unconstrained power", "second": PEAK_GRID, "sees_budget": False}
+_BUDGET: dict[str, Any] = {
+    "symbol": "averaging_s",
+    "kind": "averaging time in s",
+    "first": (DEFAULT_AVERAGING_S,),
+    "knows_amplifier": True,
+}
+_BLOCKS: dict[str, Any] = {
+    "symbol": "mu of a block",
+    "kind": "mu of a block",
+    "first": BLOCK_STEP_GRID,
+}
+_FREE: dict[str, Any] = {"keeps_budget": False, "sees_budget": False}
+_KNOWS: dict[str, Any] = {"knows_amplifier": True}
+_CHANNELS: dict[str, Any] = {"several_channels": True}
+
+
+def _made_by(name: str, settings: Settings, **about: Any) -> Algorithm:
+    """Return an entry of an algorithm of the package."""
+    return Algorithm(MAKERS[name], settings, in_core=name in CORE, **about)
+
+
+REGISTRY: dict[str, Algorithm] = {
+    "KF-ANC": _made_by("KF-ANC", _random_walk, of_paper=True, shares_gains=True, **_RANDOM_WALK, **_FREE, **_CHANNELS),
+    "KF-OPC": _made_by(
+        "KF-OPC", _constrained(_random_walk), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_CHANNELS
+    ),
+    "KF-OPC repaired": _made_by("KF-OPC repaired", _constrained(_random_walk), **_RANDOM_WALK),
+    "KF-PB": _made_by("KF-PB", _power_budget, **_BUDGET, **_CHANNELS),
+    "diagonal KF": _made_by("diagonal KF", _random_walk, **_DIAGONAL, **_FREE),
+    "diagonal KF-OPC": _made_by("diagonal KF", _constrained(_random_walk), **_DIAGONAL),
+    "FxRLS": _made_by("FxRLS", _forgetting, may_refuse=True, **_LEAST_FORGOTTEN, **_FREE, **_KNOWS),
+    "FxLMS": _made_by("FxLMS", _step, of_paper=True, **_STEP, **_FREE, **_CHANNELS),
+    "FxNLMS": _made_by("FxNLMS", _normalised, **_STEP, **_FREE, **_CHANNELS),
+    "leaky FxLMS": _made_by("leaky FxLMS", _leak, **_LEAK, **_CHANNELS),
+    "optimal leaky FxLMS": _made_by("optimal leaky FxLMS", _constrained(_step), **_STEP, **_KNOWS, **_CHANNELS),
+    "MOV-FxLMS fixed": _made_by("MOV-FxLMS", _constrained(_penalty), **_PENALTY, **_KNOWS, **_CHANNELS),
+    "MOV-FxLMS by variance": _made_by("MOV-FxLMS", _constrained(_penalty_by_variance), **_STEP, **_KNOWS),
+    "MOV-FxLMS": _made_by("MOV-FxLMS", _constrained(_step), of_paper=True, **_STEP, **_KNOWS, **_CHANNELS),
+    "MOV-MFxLMS": _made_by("MOV-MFxLMS", _constrained(_step), **_STEP, **_KNOWS, **_CHANNELS),
+    "two-gradient FxLMS": _made_by("two-gradient FxLMS", _two_gradients, **_PEAK, **_CHANNELS),
+    "re-scaling FxLMS": _made_by("re-scaling FxLMS", _peak, **_PEAK, **_CHANNELS),
+    "clipping FxLMS": _made_by("clipping FxLMS", _peak, **_PEAK, **_CHANNELS),
+    "frequency-domain FxLMS": _made_by("frequency-domain FxLMS", _in_blocks, **_BLOCKS, **_FREE),
+    "power-limited FxLMS": _made_by("band-limited FxLMS", _within_power, **_BLOCKS),
+    "band-limited FxLMS": _made_by("band-limited FxLMS", _within_bands, **_BLOCKS),
+}
+
+
+def algorithms(*, several_channels: bool = False) -> Mapping[str, Algorithm]:
+    """Return the registry of the algorithms that studies and sweeps compare, by name.
+
+    Parameters
+    ----------
+    several_channels : bool, default False
+        Whether to return the algorithms that are compared with several loudspeakers and microphones, or those compared
+        with one of each.
+
+    Returns
+    -------
+    mapping of str to Algorithm
+        A view that cannot be changed, in the order of the tables.
+
+    Examples
+    --------
+    >>> from comparisons.bench import algorithms
+    >>> [name for name, algorithm in algorithms().items() if algorithm.of_paper]
+    ['KF-ANC', 'KF-OPC', 'FxLMS', 'MOV-FxLMS']
+    >>> algorithms()["KF-OPC"].grid
+    [1e-08, 1e-07, 1e-06, 1e-05, 0.0001]
+    >>> "FxRLS" in algorithms(), "FxRLS" in algorithms(several_channels=True)
+    (True, False)
+    """
+    return MappingProxyType(
+        {name: own for name, own in REGISTRY.items() if own.several_channels or not several_channels}
+    )
+
+
+@contextmanager
+def registered(entries: Mapping[str, Algorithm]) -> Iterator[None]:
+    """Let `tune` and others know further algorithms by name for a while; those of the registry stay as they are."""
+    further = {name: own for name, own in entries.items() if name not in REGISTRY}
+    REGISTRY.update(further)
+    try:
+        yield
+    finally:
+        for name in further:
+            del REGISTRY[name]
+
+
+def make_controller(
+    scene: Scene, algorithm: str, setting: Setting, *, amplifier: Amplifier | Sequence[Amplifier] | None = None
+) -> Any:
+    """Return a fresh controller for a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        Scene that gives the taps, the known secondary path, q, P0 and the rated power.
+    algorithm : str
+        Name in the registry, see `algorithms`.
+    setting : float or tuple of float
+        A setting from its grid, or one of the same kind.
+    amplifier : amplifier, optional
+        Amplifier that the disturbance estimate knows, for algorithms that can; by default the scene's known one.
+
+    Returns
+    -------
+    Controller
+        The controller, with all weights zero.
+
+    Examples
+    --------
+    >>> from comparisons.bench import make_controller, make_scene
+    >>> from kfopc_filterpy.signals import tone
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
+    ...                    power_multiple=2.0, n_taps=8)
+    >>> make_controller(scene, "KF-OPC", 1e-6).rated_power
+    1.0
+    """
+    several = scene.secondary.ndim == 3
+    if algorithm not in algorithms(several_channels=several):
+        channels = "several channels" if several else "one channel"
+        raise ValueError(f"{algorithm} is not compared with {channels}: see algorithms(several_channels={several})")
+    own, second = REGISTRY[algorithm], setting[1] if isinstance(setting, tuple) else np.nan
+    settings = own.settings(scene, own.value(scene, setting), second)
+    if own.knows_amplifier:
+        settings["amplifier"] = scene.known_amplifier if amplifier is None else amplifier
+    if several:
+        settings["n_references"] = len(scene.references[0])
+    controller: Any = own.make(scene.n_taps, scene.known_secondary, **settings)
+    controller.name = algorithm  # the registry tells apart what one class does with different settings
+    return controller

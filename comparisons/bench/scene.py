@@ -1,0 +1,450 @@
+"""A scene to run controllers in, and the jobs that run there."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from kfopc_filterpy import HardClipAmplifier, SimulationResult, metrics, simulate, simulate_scenarios
+from kfopc_filterpy._types import Counter, NumberOrArray, PathModels
+from kfopc_filterpy._validate import as_channels, as_positive, as_signal, per_loudspeaker
+from kfopc_filterpy.bounds import (
+    WienerSolution,
+    measurement_noise_from_run,
+    power_constrained_solution,
+    wiener_solution,
+)
+from kfopc_filterpy.bounds.channel_bound import full_channel_stretch
+from kfopc_filterpy.controllers import Controller, CoreController
+from kfopc_filterpy.loop.inputs import channel_disturbances
+from kfopc_filterpy.paths import path_taps
+from kfopc_filterpy.paths.path_matrix import is_path_matrix, secondary_paths
+from kfopc_filterpy.power.amplifiers import Amplifier
+from kfopc_filterpy.verdict.runs import filtered_power, one_blas_thread
+
+SENSOR_NOISE_SEED = 1000  # added to the noise's seed
+CHANNEL_RIDGE = 1e-6  # over the filtered power: directions with less energy need weights that no controller reaches
+
+Item = TypeVar("Item")
+Outcome = TypeVar("Outcome")
+
+
+class Runs:
+    """Jobs on all cores, with one progress bar for all of them.
+
+    Threads are enough, because the compiled loop releases Python's global interpreter lock.
+
+    Parameters
+    ----------
+    bar : tqdm bar, optional
+        Bar that advances as jobs end.
+    workers : int, optional
+        Threads; by default one for each core.
+
+    Examples
+    --------
+    >>> from comparisons.bench import Runs
+    >>> runs = Runs()
+    >>> runs.map(lambda x: x**2, [1, 2, 3]), runs.done
+    ([1, 4, 9], 3)
+    """
+
+    def __init__(self, bar: Counter | None = None, workers: int | None = None) -> None:
+        self.bar = bar
+        self.done = 0
+        self._pool = ThreadPoolExecutor(max_workers=workers or os.cpu_count())
+
+    def map(
+        self, job: Callable[[Item], Outcome], items: Iterable[Item], worth: Callable[[Item], int] = lambda item: 1
+    ) -> list[Outcome]:
+        """Return the results of `job` for each of the `items`, in their order.
+
+        `worth` gives the number of planned runs that an item counts for.
+        """
+        items, outcomes = list(items), []
+        with one_blas_thread():
+            for item, outcome in zip(items, self._pool.map(job, items), strict=True):
+                outcomes.append(outcome)
+                self.done += worth(item)
+                if self.bar is not None:
+                    self.bar.update(worth(item))
+        return outcomes
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Noise, paths and amplifier of a study, and what its controllers know of them.
+
+    `make_scene` makes one. There is one reference and one disturbance for each seed, all of equal length. With several
+    channels, the first axis of a signal is the channel, and the powers of loudspeakers are (J,).
+
+    Parameters
+    ----------
+    fs : float
+        Sampling frequency in Hz.
+    secondary : ndarray, shape (n_path_taps,) or (K, J, n_path_taps)
+        True secondary path.
+    references, disturbances : list of ndarray, shape (n_samples,), or (I, n_samples) and (K, n_samples)
+        One for each seed.
+    rated_power : float or ndarray, shape (J,)
+        Rated output power, a mean square.
+    n_taps : int
+        Taps of the control filter.
+    sensor_noise_std : float
+        Standard deviation of the noise that is added to the error.
+    switch_on_s : float
+        Time in seconds for which the noise runs before the control is switched on.
+    nse_window_s : float
+        Window of the normalised squared error in seconds.
+    amplifier : amplifier, optional
+        Amplifier; linear by default.
+    measurement_noise : float
+        q of the Kalman filters.
+    initial_variance : float
+        P0 of the Kalman filters.
+    unconstrained_power : float or ndarray, shape (J,)
+        Output power that the noise would need without a constraint.
+    wiener_noise_reduction_db : float
+        Noise reduction of that solution in dB.
+    seeds : list of int
+        Seeds of the noises.
+    secondary_estimate : ndarray, optional
+        Secondary path that controllers know; by default the true one.
+    secondary_path_uncertainty : PathTolerance, float or array_like, optional
+        Uncertainty of that path that KF-PB takes account of, see `paths.path_uncertainty`; by default none.
+    known_amplifier : amplifier, optional
+        Amplifier that disturbance estimates know; by default they take it to be linear.
+    power_memory_s : float, default 0.5
+        Memory in seconds of the power estimates of the constrained algorithms.
+    clips_at : float or ndarray, shape (J,), optional
+        Limit of the amplifiers, if it is not the peak of a sine at rated power.
+    """
+
+    fs: float
+    secondary: np.ndarray
+    references: list[np.ndarray]
+    disturbances: list[np.ndarray]
+    rated_power: Any
+    n_taps: int
+    sensor_noise_std: float
+    switch_on_s: float
+    nse_window_s: float
+    amplifier: Amplifier | Sequence[Amplifier] | None = None
+    measurement_noise: float = 0.0
+    initial_variance: float = 0.0
+    unconstrained_power: Any = 1.0
+    wiener_noise_reduction_db: float = 0.0
+    seeds: list[int] = field(default_factory=list)
+    secondary_estimate: np.ndarray | None = None
+    secondary_path_uncertainty: Any = None
+    known_amplifier: Amplifier | Sequence[Amplifier] | None = None
+    power_memory_s: float = 0.5
+    clips_at: Any = None
+
+    @property
+    def sensor_noise_seeds(self) -> list[int]:
+        """Seeds of the sensor noise, apart from those of the noises."""
+        return [SENSOR_NOISE_SEED + seed for seed in self.seeds]
+
+    @property
+    def amplitude_limit(self) -> NumberOrArray:
+        """Limit of the clipping amplifiers, or of each: `clips_at`, by default the peak of a sine at rated power."""
+        limit = np.sqrt(2 * self.rated_power) if self.clips_at is None else self.clips_at
+        return limit if np.ndim(limit) else float(limit)
+
+    @property
+    def settled(self) -> tuple[np.ndarray, np.ndarray]:
+        """First reference and disturbance from switch-on, after the start-up of the primary path."""
+        start = int(self.switch_on_s * self.fs)
+        return self.references[0][..., start:], self.disturbances[0][..., start:]
+
+    @property
+    def known_secondary(self) -> np.ndarray:
+        """Secondary path that the controllers know."""
+        return self.secondary if self.secondary_estimate is None else self.secondary_estimate
+
+    @property
+    def filtered_power(self) -> float:
+        """Power of the filtered reference; it makes step sizes and state noises comparable."""
+        return filtered_power(self.references[0], self.known_secondary)
+
+    @property
+    def secondary_gain(self) -> float:
+        """Power gain G_s of the known secondary path for the reference (eq. 11)."""
+        return self.filtered_power / _power(self.references[0])
+
+    def run(self, controller: Controller, seed_index: int = 0, **options: Any) -> SimulationResult:
+        """Run a `controller` on the noise of one seed, of index `seed_index`; `options` go to `simulate`."""
+        return simulate(controller, self.references[seed_index], **self._options(seed_index) | options)
+
+    def run_together(
+        self, controllers: Sequence[CoreController], seed_index: int = 0, **options: Any
+    ) -> list[SimulationResult]:
+        """Run `controllers` that share their gains on the noise of one seed, of index `seed_index`.
+
+        `options` go to `simulate_scenarios`.
+        """
+        return simulate_scenarios(controllers, self.references[seed_index], **self._options(seed_index) | options)
+
+    def _options(self, seed_index: int) -> dict[str, Any]:
+        names = ("fs", "rated_power", "amplifier", "sensor_noise_std", "switch_on_s")
+        own = {"disturbance": self.disturbances[seed_index], "rng": self.sensor_noise_seeds[seed_index]}
+        return {**own, "secondary_path": self.secondary, **{name: getattr(self, name) for name in names}}
+
+
+def make_scene(
+    references: Mapping[int, np.ndarray],
+    primary: PathModels,
+    secondary: PathModels,
+    *,
+    fs: float,
+    rated_power: float,
+    power_multiple: float,
+    n_taps: int,
+    switch_on_s: float = 0.5,
+    sensor_noise_db: float = -60.0,
+    nse_window_s: float = 0.005,
+    amplifier: Amplifier | None = None,
+) -> Scene:
+    """Return a scene whose noises need a multiple of the rated power.
+
+    The references get the power at which the unconstrained Wiener control filter of the first one needs
+    `power_multiple` times the rated power. q is the estimate of eq. 7 from the first noise without control. P0 is the
+    Wiener control power divided by the number of taps and by the reference power. None of these takes account of
+    directions of the weights in which the reference has hardly any energy (see `wiener_solution`), because no
+    controller reaches the weights needed there.
+
+    Parameters
+    ----------
+    references : mapping of int to ndarray, shape (n_samples,) or (I, n_samples)
+        Noise for each seed.
+    primary, secondary : array_like or control.LTI
+        Primary and secondary path: taps, or a python-control system. With several channels (K, I, n) and (K, J, n).
+    fs : float
+        Sampling frequency in Hz.
+    rated_power : float or ndarray, shape (J,)
+        Rated output power, a mean square; of all loudspeakers or of each.
+    power_multiple : float
+        Unconstrained control power over the rated power, each summed over the loudspeakers.
+    n_taps : int
+        Taps of the control filter.
+    switch_on_s : float, default 0.5
+        Time in seconds for which the noise runs before the control is switched on.
+    sensor_noise_db : float, default -60.0
+        Power of the sensor noise over that of the disturbance in dB.
+    nse_window_s : float, default 0.005
+        Window of the normalised squared error in seconds.
+    amplifier : amplifier, optional
+        Amplifier; linear by default.
+
+    Returns
+    -------
+    Scene
+        The scene, which is not changed by runs.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A rated power that is not positive, a noise that is not longer than `switch_on_s`, or paths and references whose
+        numbers of channels do not fit.
+
+    Examples
+    --------
+    >>> from comparisons.bench import make_scene
+    >>> from kfopc_filterpy.signals import tone
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
+    ...                    power_multiple=2.0, n_taps=8)
+    >>> round(float((scene.references[0] ** 2).mean()), 3)  # the path has a gain of 1
+    2.0
+    """
+    s = secondary_paths(secondary, fs=fs)[0] if is_path_matrix(secondary) else path_taps(secondary, fs=fs)
+    rated_power = _as_rating(rated_power, s)
+    signals = {seed: _as_reference(x, switch_on_s, fs, s) for seed, x in references.items()}
+    first = next(iter(signals.values()))
+    settled = (..., slice(int(switch_on_s * fs), None))  # after the start-up of the primary path
+    d = _heard(first, primary, s, fs)
+    wiener = reachable_solution(first[settled], d[settled], s, n_taps, fs)
+    asked = power_multiple * np.sum(rated_power * np.ones(np.shape(wiener.control_power)))
+    share = wiener.control_power / np.sum(wiener.control_power)
+    power = _power(first) * asked / np.sum(wiener.control_power)
+    scaled = [np.sqrt(power / _power(x)) * x for x in signals.values()]
+    disturbances = [_heard(x, primary, s, fs) for x in scaled]
+    std = float(np.sqrt(np.mean(disturbances[0][settled] ** 2)) * 10 ** (sensor_noise_db / 20))
+    recorded = disturbances[0][settled]
+    recorded = recorded + std * np.random.default_rng(0).standard_normal(recorded.shape)
+    return Scene(
+        fs=fs,
+        secondary=s,
+        references=scaled,
+        disturbances=disturbances,
+        rated_power=rated_power,
+        n_taps=n_taps,
+        sensor_noise_std=std,
+        switch_on_s=switch_on_s,
+        nse_window_s=nse_window_s,
+        amplifier=amplifier,
+        measurement_noise=_unexplained(scaled[0][settled], recorded, s, n_taps, fs),
+        initial_variance=float(asked / (n_taps * power * np.size(share))),
+        unconstrained_power=asked * share,
+        wiener_noise_reduction_db=wiener.noise_reduction_db,
+        seeds=list(references),
+    )
+
+
+def with_clipping(scene: Scene) -> Scene:
+    """Return a scene of one channel with an amplifier that clips, and the q of eq. 7 with it.
+
+    The amplifier clips at the peak of a sine of rated power. The measurement is then d + s * (y - clip(y)), so e_o of
+    eq. 1b contains what is clipped off. It is estimated from the best control signal of rated power, as a batch fit's
+    residual: a control filter can take over the part of it that is proportional to y.
+
+    Parameters
+    ----------
+    scene : Scene
+        Scene with a linear amplifier.
+
+    Returns
+    -------
+    Scene
+        The same scene with the amplifier and its q.
+
+    Examples
+    --------
+    >>> from comparisons.bench import make_scene, with_clipping
+    >>> x = np.random.default_rng(0).standard_normal(8000)
+    >>> scene = make_scene({0: x}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=0.5, power_multiple=4.0, n_taps=8)
+    >>> clipped = with_clipping(scene)
+    >>> clipped.amplifier.limit, bool(clipped.measurement_noise > 100 * scene.measurement_noise)
+    (1.0, True)
+    """
+    amplifier = HardClipAmplifier(scene.amplitude_limit)
+    x, d = scene.settled
+    with reachable_weights():
+        bound = power_constrained_solution(x, d, scene.secondary, scene.n_taps, scene.rated_power)
+    y = np.convolve(x, bound.weights)[: x.size]
+    lost = np.convolve(y - amplifier(y), scene.secondary)[: x.size]
+    q = scene.measurement_noise
+    if np.any(lost):  # else the rating is ample
+        q += _unexplained(x, lost, scene.secondary, scene.n_taps, scene.fs)
+    return replace(scene, amplifier=amplifier, measurement_noise=q)
+
+
+def louder(scene: Scene, gain: float) -> Scene:
+    """Return the scene with all signals times a gain, and the measurement noise with them."""
+    return replace(
+        scene,
+        references=[gain * x for x in scene.references],
+        disturbances=[gain * d for d in scene.disturbances],
+        sensor_noise_std=gain * scene.sensor_noise_std,
+        measurement_noise=gain**2 * scene.measurement_noise,
+        unconstrained_power=gain**2 * scene.unconstrained_power,
+    )
+
+
+def _as_rating(rated_power: Any, s: np.ndarray) -> Any:
+    """Return a rated power, or one for each loudspeaker if several are given."""
+    if s.ndim == 1 or np.ndim(rated_power) == 0:
+        return as_positive(rated_power, "rated_power")
+    return per_loudspeaker(rated_power, s.shape[1], "rated_power")
+
+
+def _as_reference(x: Any, switch_on_s: float, fs: float, s: np.ndarray) -> np.ndarray:
+    """Return a noise as (n_samples,), or as (I, n_samples) with several channels."""
+    x = as_signal(x, "references") if s.ndim == 1 else np.atleast_2d(as_channels(x, "references"))
+    if x.shape[-1] <= int(switch_on_s * fs):
+        raise ValueError(f"references must be longer than switch_on_s = {switch_on_s:g} s, got {x.shape[-1] / fs:g} s")
+    return x
+
+
+def _power(x: np.ndarray) -> float:
+    """Return the mean square of a reference, or the sum of those of several."""
+    return float(np.mean(x**2, axis=-1).sum())
+
+
+def _heard(x: np.ndarray, primary: Any, s: np.ndarray, fs: float) -> np.ndarray:
+    """Return the disturbance of a reference, or of several."""
+    if s.ndim == 1:
+        return np.convolve(x, path_taps(primary, fs=fs))[: x.size]
+    return channel_disturbances(x, primary, None, fs, len(s))
+
+
+def reachable_solution(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> WienerSolution:
+    """Return the unconstrained Wiener solution whose weights a controller can reach."""
+    if s.ndim == 1:
+        with reachable_weights():
+            return wiener_solution(x, d, s, n_taps)
+    record = full_channel_stretch(x, d, s, n_taps, fs)
+    return record.solution(record.correlations().weights(ridge=CHANNEL_RIDGE * record.filtered_power))
+
+
+def _unexplained(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> float:
+    """Return q, the power that no control filter explains (eq. 7), per microphone."""
+    if s.ndim == 1:
+        with reachable_weights():
+            return measurement_noise_from_run(x, d, s, n_taps)
+    return float(reachable_solution(x, d, s, n_taps, fs).error_power)
+
+
+@contextmanager
+def reachable_weights() -> Iterator[None]:
+    """Silence the warning that very large weights in directions without energy would do better.
+
+    Level and q should belong to weights that a controller with the scene's P0 reaches, and none reaches such weights.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", np.exceptions.RankWarning)
+        yield
+
+
+def figures_of_merit(results: Sequence[SimulationResult], scene: Scene) -> dict[str, float | None]:
+    """Return the figures of merit of one algorithm: means over seeds, the NSE pooled over seeds.
+
+    With several loudspeakers, the figures of the control signal are those of the loudspeaker for which they are largest
+    over its rating: powers over the rated power, peaks over its root. With several microphones, the errors are taken
+    together.
+
+    Parameters
+    ----------
+    results : sequence of SimulationResult
+        Runs of the algorithm, one for each seed.
+    scene : Scene
+        Scene of the runs.
+
+    Returns
+    -------
+    dict of str to float or None
+        The keys that a `StudyReport` takes; None if undefined.
+
+    Examples
+    --------
+    >>> from comparisons.bench import figures_of_merit, make_controller, make_scene
+    >>> from kfopc_filterpy.signals import tone
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
+    ...                    power_multiple=2.0, n_taps=8)
+    >>> figures = figures_of_merit([scene.run(make_controller(scene, "KF-OPC", 1e-6))], scene)
+    >>> round(figures["output_power"], 2)
+    1.0
+    """
+    scale = np.sqrt(scene.rated_power) if np.ndim(scene.rated_power) else np.ones(())
+    limit, control = scene.amplitude_limit / scale, [r.control_signal / scale[..., np.newaxis] for r in results]
+    diverged = [r.diverged_at_s for r in results if r.diverged_at_s is not None]
+    errors = np.array([r.error for r in results])
+    disturbances = np.array([r.disturbance for r in results])
+    return {
+        "noise_reduction_db": float(np.mean([metrics.noise_reduction_db(r.error, r.disturbance) for r in results])),
+        "output_power": float(np.mean([np.max(metrics.output_power(y)) for y in control])),
+        "peak_control_signal": float(np.mean([np.max(metrics.peak_control_signal(y)) for y in control])),
+        "clipped_fraction": float(np.mean([np.max(metrics.clipped_fraction(y, limit)) for y in control])),
+        "harmonics_db": None,
+        "convergence_time_s": metrics.convergence_time_s(
+            errors, disturbances, scene.fs, window_s=scene.nse_window_s, runs=True
+        ),
+        "diverged_at_s": min(diverged) if diverged else None,
+    }

@@ -1,0 +1,5 @@
+"""The verdict on an amplifier from recordings: enough or not, what limits, and what to change."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

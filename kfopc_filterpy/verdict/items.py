@@ -1,0 +1,205 @@
+"""What a page shows, and writes as files beside it: tables, figures, sounds."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .._writing import made_folder, write_whole
+from ..plot import save_figure
+from ..signals import write_wav
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+HEADROOM = 4.0  # peak of a sound, over that of the first sound, beyond which it is clipped
+EXCERPT_S = 4.0  # what a page plays of a sound; the file has all of it
+
+
+def _shown(cell: str | float) -> str:
+    if isinstance(cell, str):
+        return cell
+    return "–" if np.isnan(cell) else f"{cell:.4g}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text and numbers: page and terminal show four digits, the file all of them.
+
+    Parameters
+    ----------
+    stem : str
+        End of the file's name.
+    caption : str
+        Caption.
+    headings : sequence of str
+        Headings of the columns.
+    rows : sequence of sequence
+        Rows of cells, each a text or a number.
+
+    Raises
+    ------
+    ValueError
+        A row has another number of cells than there are headings, or the stem cannot name a file.
+    """
+
+    stem: str
+    caption: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str | float]]
+
+    def __post_init__(self) -> None:
+        require_stem(self.stem, "stem")
+        for row in self.rows:
+            if len(row) != len(self.headings):
+                raise ValueError(f"rows must have {len(self.headings)} cells, as there are headings, got {row}")
+
+    @property
+    def cells(self) -> list[list[str]]:
+        """Cells as they are shown."""
+        return [[_shown(cell) for cell in row] for row in self.rows]
+
+    @property
+    def numbers(self) -> set[int]:
+        """Columns with a number in them."""
+        return {i for row in self.rows for i, cell in enumerate(row) if not isinstance(cell, str)}
+
+
+@dataclass(frozen=True)
+class FigureItem:
+    """A figure with its caption. pyplot is made to forget it, since a report holds many.
+
+    Parameters
+    ----------
+    stem : str
+        End of the names of its files.
+    caption : str
+        Caption.
+    figure : matplotlib.figure.Figure
+        The figure.
+    """
+
+    stem: str
+    caption: str
+    figure: Figure
+
+    def __post_init__(self) -> None:
+        import matplotlib.pyplot as plt
+
+        require_stem(self.stem, "stem")
+        plt.close(self.figure)
+
+    @property
+    def alt(self) -> str:
+        """What is drawn, in words: the axes and the names of the curves."""
+        names = dict.fromkeys(
+            text for ax in self.figure.axes for text in ax.get_legend_handles_labels()[1] if not text.startswith("_")
+        )
+        drawn = dict.fromkeys(filter(None, (_axes_in_words(ax, self.figure.axes) for ax in self.figure.axes)))
+        curves = f". Curves: {'; '.join(names)}." if names else "."
+        text = f"Plot of {'; '.join(drawn)}{curves}" if drawn else ""
+        return re.sub(r"[${}\\]|\\mathrm", "", text)  # the marks of matplotlib's formulas
+
+
+def _axes_in_words(ax: Axes, others: Sequence[Axes]) -> str:
+    """Return an axes' labels; one that shares its time or frequency axis has the label of the lowest."""
+    below = next((own.get_xlabel() for own in [ax, *others] if own.get_xlabel()), "")
+    words = [ax.get_ylabel(), below] if ax.get_ylabel() else []
+    return " over ".join(" ".join(word.split()) for word in words if word)
+
+
+@dataclass(frozen=True)
+class Sound:
+    """A sound with its label.
+
+    Parameters
+    ----------
+    stem : str
+        End of its file's name.
+    label : str
+        Label.
+    signal : ndarray, shape (n_samples,)
+        The sound; NaN at its end if the run diverged.
+    group : str, default ""
+        Sounds of one group are of one moment, so that the page switches between them while they play. The first one is
+        the noise without control.
+    from_s : float, default 0.0
+        Where the excerpt begins that the page plays, in s.
+
+    Raises
+    ------
+    ValueError
+        The stem cannot name a file, or the excerpt begins before the sound.
+    """
+
+    stem: str
+    label: str
+    signal: np.ndarray
+    group: str = ""
+    from_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_stem(self.stem, "stem")
+        if not self.from_s >= 0:
+            raise ValueError(f"from_s must be a time in s from 0 on, got {self.from_s}")
+
+    def excerpt(self, signal: np.ndarray, fs: float) -> np.ndarray:
+        """Return the part of a signal, of `fs` samples per second, that the page plays: 4 s, or what there is of them."""
+        first = round(self.from_s * fs)
+        return signal[first : first + round(EXCERPT_S * fs)]
+
+
+def file_of(folder: Path, name: str, item: FigureItem | Sound | Table) -> Path:
+    """Return the path of a sound, of a table, or of a figure, that one without its suffix; it begins with a `name`."""
+    kind, suffix = {FigureItem: ("figures", ""), Sound: ("audio", ".wav"), Table: ("tables", ".csv")}[type(item)]
+    return folder / kind / f"{name}-{item.stem}{suffix}"
+
+
+def loudness(signals: Iterable[np.ndarray]) -> tuple[list[np.ndarray], float]:
+    """Return the signals, clipped at full scale, and full scale, which is one peak for all of them.
+
+    It is the peak of the loudest, but at most 4 times that of the first: a run that diverges would silence the rest.
+    """
+    signals = [np.asarray(signal, dtype=np.float64) for signal in signals]
+    peaks = [float(np.max(np.abs(signal), initial=0.0, where=~np.isnan(signal))) for signal in signals]
+    if not any(peaks):
+        return signals, 1.0
+    full_scale = min(max(peaks), HEADROOM * peaks[0]) if peaks[0] > 0 else max(peaks)
+    return [np.clip(signal, -full_scale, full_scale) for signal in signals], full_scale
+
+
+def write_files(
+    folder: Path,
+    name: str,
+    *,
+    fs: float,
+    figures: Sequence[FigureItem] = (),
+    sounds: Sequence[Sound] = (),
+    tables: Sequence[Table] = (),
+) -> None:
+    """Write figures/, audio/ and, if there are any, tables/ into a folder; all files begin with a `name`."""
+    for kind in ("figures", "audio"):
+        made_folder(folder / kind)
+    for item in figures:
+        save_figure(item.figure, file_of(folder, name, item))
+    signals, full_scale = loudness(sound.signal for sound in sounds)
+    for sound, signal in zip(sounds, signals, strict=True):
+        write_wav(file_of(folder, name, sound), signal, fs, peak=full_scale)
+    for table in tables:
+        made_folder(folder / "tables")
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([table.headings, *table.rows])
+        write_whole(file_of(folder, name, table), text.getvalue())
+
+
+def require_stem(name: str, argument: str) -> None:
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name):
+        raise ValueError(f"{argument} must be lower-case letters, digits and '-', for it names files, got {name!r}")

@@ -1,0 +1,323 @@
+"""The report: strict JSON, a page that needs no other file, sounds of one scale, tables, refusals."""
+
+import base64
+import csv
+import io
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import soundfile
+from helpers.reports import FS, D, figure, study
+from matplotlib.figure import Figure
+
+from comparisons.bench import report
+from comparisons.bench.descriptions import DESCRIPTIONS
+from comparisons.bench.registry import REGISTRY
+from comparisons.bench.report import results_table, write_report
+from comparisons.bench.study_report import FigureItem, Sound, Table
+from kfopc_filterpy.signals import read_recording
+
+
+class _Links(HTMLParser):
+    """Collect what a page refers to, its ids and its text; see that its tags are closed in order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.references, self.ids, self.tags, self.open, self.text = [], [], [], [], ""
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        if tag not in ("meta", "img", "br", "input"):
+            self.open.append(tag)
+        for key, value in attrs:
+            if key in ("src", "href", "srcset", "data", "action", "poster"):
+                self.references.append((tag, value))
+            if key == "id":
+                self.ids.append(value)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] not in (["style"], ["script"]):
+            self.text += data
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report") / "new" / "folder"
+    page = write_report([study(), study("duct-measured", figures=[], sounds=[], notes=[], extra={})], folder)
+    assert page == folder / "report.html"
+    return folder
+
+
+def test_results_are_strict_json_of_the_agreed_layout(written):
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    results = json.loads((written / "results.json").read_text(encoding="utf-8"), parse_constant=refuse)
+    assert list(results) == ["studies"]
+    assert list(results["studies"]) == ["tonal", "duct-measured"]
+    study = results["studies"]["tonal"]
+    assert set(study) == {"rated_power", "parameters", "algorithms", "claims", "extra"}
+    assert study["rated_power"] == 0.8
+    assert study["parameters"] == {"q": 1e-4, "seeds": [0, 1, 2], "tried": [[1e-7, None], [1e-6, "diverged"]]}
+    assert study["algorithms"]["KF-ANC"] == {
+        "noise_reduction_db": 8.125,
+        "output_power": None,
+        "peak_control_signal": None,
+        "clipped_fraction": None,
+        "harmonics_db": None,
+        "convergence_time_s": None,
+        "diverged_at_s": 1.5,
+    }
+    assert study["claims"][1] == {"text": "it is faster", "holds": False, "measured": "no"}
+    assert study["extra"] == {"sweep": {"over_db": [0, 1], "best": [1.0, None]}, "flip": 4.5}
+
+
+def test_page_needs_no_other_file(written):
+    source = (written / "report.html").read_text(encoding="utf-8")
+    page = _Links(source)
+    anchors = [reference for tag, reference in page.references if reference.startswith("#")]
+    links = [reference for tag, reference in page.references if tag == "a" and not reference.startswith("#")]
+    data = [reference for tag, reference in page.references if tag != "a"]
+    assert {anchor[1:] for anchor in anchors} <= set(page.ids)
+    assert len(page.ids) == len(set(page.ids))
+    assert links == ["audio/tonal-disturbance.wav", "audio/tonal-kf-anc.wav"]  # in full length, beside the page
+    assert all((written / link).is_file() for link in links)
+    assert len(data) == 4
+    assert all(re.match(r"data:(image/png|audio/flac);base64,[A-Za-z0-9+/=]+$", own) for own in data)
+
+
+def test_page_uses_no_network(written):
+    source = (written / "report.html").read_text(encoding="utf-8")
+    assert not {"link", "iframe", "object"} & set(_Links(source).tags)
+    assert not re.search(r"https?:|@import|url\(|fetch\(|import\(|XMLHttpRequest|<script src", source)
+    assert "default-src 'none'" in source  # and the browser holds it to that
+
+
+def test_words_for_a_figure():
+    drawn = Figure()
+    above, below = drawn.subplots(2, sharex=True)
+    above.plot([0, 1], label="KF-OPC")
+    below.plot([0, 1], label="_limit")
+    above.set_ylabel("error (dB)")
+    below.set(ylabel=r"factor $\alpha$", xlabel="time (s)")
+    alt = FigureItem("a", "Caption", drawn).alt
+    assert alt == "Plot of error (dB) over time (s); factor alpha over time (s). Curves: KF-OPC."
+    assert FigureItem("a", "Caption", Figure()).alt == ""
+
+
+def test_page_says_everything_and_escapes_it(written):
+    source = (written / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"<(hard|of|note)>", source)
+    text = _Links(source).text
+    for said in (
+        "Tone & clip <hard>",
+        "2 of the 4 claims of the paper were reproduced",
+        "✓ reproduced",
+        "✗ not reproduced",
+        "0.79971 of 0.8",
+        "estimate <of> eq. 7",
+        "1e-07, –",
+        'Spectra "of" e & d.',
+        "Residual, full length (silent after the divergence)",
+        "One <note>.",
+    ):
+        assert said in text, said
+    assert "nan" not in text.lower()
+
+
+def test_figures_and_sounds_are_files_too(written):
+    assert {path.name for path in (written / "figures").iterdir()} == {
+        f"{stem}.{kind}" for stem in ("at-a-glance", "tonal-a-spectra") for kind in ("png", "svg")
+    }
+    disturbance = read_recording(written / "audio" / "tonal-disturbance.wav")
+    loud, soft = disturbance.samples, read_recording(written / "audio" / "tonal-kf-anc.wav").samples
+    assert disturbance.fs == FS
+    assert np.max(np.abs(loud)) == pytest.approx(1.0, abs=1e-3)
+    np.testing.assert_allclose(soft[:-1], loud[:-1] / 2, atol=1e-4)  # one scale
+    assert soft[-1] == 0
+    assert not list(written.glob(".*"))
+
+
+def test_a_residual_far_louder_than_the_disturbance_does_not_silence_it(tmp_path):
+    made = study(sounds=[Sound("disturbance", "Disturbance", D), Sound("fxlms", "Residual", 1e6 * D)])
+    page = write_report([made], tmp_path).read_text(encoding="utf-8")
+    assert np.max(np.abs(read_recording(tmp_path / "audio" / "tonal-disturbance.wav").samples)) == pytest.approx(
+        0.25, abs=1e-3
+    )
+    assert "louder than full scale: clipped" in page
+    silent = study(sounds=[Sound("disturbance", "Disturbance", 0 * D)], figures=[])
+    write_report([silent], tmp_path)
+    assert not np.any(read_recording(tmp_path / "audio" / "tonal-disturbance.wav").samples)
+
+
+def _inlined_sounds(source):
+    """Return the sounds of a page, decoded, with their sampling frequencies."""
+    found = re.findall(r"data:audio/flac;base64,([A-Za-z0-9+/=]+)", source)
+    return [soundfile.read(io.BytesIO(base64.b64decode(data))) for data in found]
+
+
+def test_the_page_plays_excerpts_of_one_moment(tmp_path):
+    fs, n = 8000, 8000 * 12
+    x = np.random.default_rng(0).standard_normal(n)
+    sounds = [Sound("disturbance", "Control off", x, "noise", 2.0), Sound("kf", "KF-OPC", -x / 4, "noise", 2.0)]
+    source = write_report([study(sounds=sounds, figures=[])], tmp_path).read_text(encoding="utf-8")
+    (off, rate), (on, _) = _inlined_sounds(source)
+    assert rate == fs
+    assert off.size == 4 * fs
+    np.testing.assert_allclose(
+        off, x[2 * fs : 6 * fs] / np.abs(x).max(), atol=1e-4
+    )  # the file's scale and the file's bits
+    np.testing.assert_allclose(on, -off / 4, atol=1e-4)  # the same moment
+    assert read_recording(tmp_path / "audio" / "tonal-kf.wav").samples.size == n  # the file has all of it
+    assert len(source) < 2 * (4 * fs * 2) * 4 / 3 + 100_000  # at most what 16 bits take; lossless packing takes less
+
+
+def test_same_studies_same_bytes(tmp_path):
+    pages = [write_report([study()], tmp_path / name).read_bytes() for name in ("one", "two")]
+    assert pages[0] == pages[1]
+
+
+POWERS = Table(
+    "powers",
+    "Powers < 1 & more",
+    ["paths", "noise, of <kind>", "power"],
+    [["duct", 'tone "300"', 0.123456789], ["band-pass", "diverged", np.float64(1e6)], ["duct", 7.0, 3]],
+)
+EMPTY = Table("none", "Nothing to show", ["paths", "power"], [])
+
+
+def test_a_table_on_the_page_is_escaped_and_of_numbers(tmp_path):
+    source = write_report([study(tables=[POWERS, EMPTY]), study("duct")], tmp_path).read_text(encoding="utf-8")
+    (_, part) = source.split("Powers &lt; 1 &amp; more</h3>")  # one heading: the other study has no table
+    rows = [
+        re.findall(r'<t[hd][^>]* class="(\w+)">(.*?)</t[hd]>', row) for row in part.split("</table>")[0].split("<tr>")
+    ]
+    assert [[text for _, text in row] for row in rows[1:]] == [
+        ["paths", "noise, of &lt;kind&gt;", "power"],
+        ["duct", "tone &#34;300&#34;", "0.1235"],
+        ["band-pass", "diverged", "1e+06"],
+        ["duct", "7", "3"],
+    ]
+    assert all(
+        [kind for kind, _ in row] == ["value", "number", "number"] for row in rows[1:]
+    )  # of numbers where one is
+    assert "Nothing to show" not in source
+
+
+def test_the_table_for_the_terminal():
+    """A mean square of 1 is 12.5 W, as 10 V per unit into 8 ohm are; ratios stay as they are."""
+    for watt, rated, power in ((None, "0.8", "0.79971"), (12.5, "10 W", "9.9964")):
+        lines = results_table([study(watt_per_power=watt)]).splitlines()
+        assert lines[0] == f"tonal: Tone & clip <hard> (rated power {rated})"
+        assert lines[3].split() == ["KF-ANC", "8.1", "-", "-", "-", "-", "-", "-", "1.5"]
+        assert lines[4].split() == ["KF-OPC", "-", power, "0.9996", "-", "25.00", "-", "-", "-"]
+        assert [" ".join(line.split()) for line in lines[5:9]] == [
+            *("REPRODUCED KF-OPC < rated", "0.79971 of 0.8"),
+            *("NOT REPRODUCED it is faster", "no"),
+        ]
+        assert max(map(len, lines)) <= 120
+
+
+def test_output_powers_on_the_page_are_in_watts_and_in_the_results_as_they_are(tmp_path):
+    source = write_report([study(watt_per_power=12.5)], tmp_path).read_text(encoding="utf-8")
+    assert "Output power (W)" in source
+    assert "= 10 W, sampling frequency" in source
+    assert json.loads((tmp_path / "results.json").read_text())["studies"]["tonal"]["rated_power"] == 0.8
+
+
+def test_the_terminal_shows_one_table_beside_the_claims():
+    """The first that fits a screen, unless there are figures of merit; what claims nothing shows all that fit."""
+    long = Table("long", "Too long", ["power"], [[1.0]] * 31)
+    tables = [long, POWERS, EMPTY]
+
+    def shown(**changes):
+        printed = results_table([study(tables=tables, **changes)])
+        return [table.stem for table in tables if table.caption in printed]
+
+    assert shown() == []
+    assert shown(algorithms={}) == ["powers"]
+    assert shown(claims=[]) == ["powers", "none"]
+
+
+def test_a_table_as_a_file_has_all_digits(tmp_path):
+    write_report([study(tables=[POWERS, EMPTY]), study("duct")], tmp_path)
+    assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == ["tonal-none.csv", "tonal-powers.csv"]
+    with (tmp_path / "tables" / "tonal-powers.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == ["paths", "noise, of <kind>", "power"]
+    assert rows[1:] == [
+        ["duct", 'tone "300"', "0.123456789"],
+        ["band-pass", "diverged", "1000000.0"],
+        ["duct", "7.0", "3"],
+    ]
+    assert (tmp_path / "tables" / "tonal-none.csv").read_bytes() == b"paths,power\n"
+
+
+def test_figures_held_for_the_report_are_unknown_to_pyplot():
+    plt.close("all")  # those that tests before this one have left
+    for i in range(25):  # pyplot warns from 21 open figures on
+        FigureItem(f"f{i}", "", plt.subplots()[0])
+    assert not plt.get_fignums()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: study("../tonal"), "name must be lower-case letters"),
+        (lambda: Sound("a b", "", D), "stem must be lower-case letters"),
+        (lambda: Sound("a", "", D, from_s=-1.0), "from_s must be a time in s from 0 on, got -1"),
+        (lambda: Table("../powers", "", [], []), r"stem must be lower-case letters.*got '../powers'"),
+        (lambda: Table("powers", "", ["x", "y"], [[1.0]]), "rows must have 2 cells, as there are headings, got"),
+        (lambda: study(figures=2 * [FigureItem("a", "", figure())]), "figures of study 'tonal' .* got a twice"),
+        (lambda: study(tables=[POWERS, EMPTY, POWERS]), "tables of study 'tonal' .* got powers twice"),
+        (lambda: study(algorithms={"KF-ANC": {"loudness": 1.0}}), r"unknown figures of merit \['loudness'\]"),
+    ],
+)
+def test_what_no_study_holds_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("studies", "error", "message"),
+    [
+        ([], ValueError, "studies must hold at least one"),
+        ([study(), study()], ValueError, "studies must have different names, got tonal twice"),
+        ([study(extra={"path": Path()})], TypeError, r"study 'tonal', 'extra', 'path' must hold numbers.*got \w+Path"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_anything_is(studies, error, message, tmp_path):
+    with pytest.raises(error, match=message):
+        write_report(studies, tmp_path / "unused")
+    assert not (tmp_path / "unused").exists()
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"file' cannot be written .*choose another output folder"):
+        report.prepare_folder(tmp_path / "file")
+    with pytest.raises(OSError, match="cannot be written"):
+        write_report([study()], tmp_path / "file" / "below")
+
+
+def test_a_report_that_fails_leaves_the_old_one(tmp_path):
+    write_report([study()], tmp_path)
+    before = (tmp_path / "report.html").read_bytes()
+    with pytest.raises(UnicodeEncodeError):
+        write_report([study(notes=["\ud800"])], tmp_path)  # cannot be encoded
+    assert (tmp_path / "report.html").read_bytes() == before
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_every_algorithm_has_a_description():
+    assert set(DESCRIPTIONS) == set(REGISTRY)

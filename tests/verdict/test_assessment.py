@@ -1,0 +1,334 @@
+"""The verdict on a rating: each cause from both sides, what it promises, its JSON, its page."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import re
+from dataclasses import replace
+from datetime import date
+
+import jsonschema
+import numpy as np
+import pytest
+from scipy.signal import firwin, welch
+
+from kfopc_filterpy import __version__
+from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
+from kfopc_filterpy.signals import Recording, band_limited_noise
+from kfopc_filterpy.verdict import assess
+from kfopc_filterpy.verdict.assessment import CAUSES, SCHEMA, advice_on
+from kfopc_filterpy.verdict.runs import STEP_SIZES
+
+FS, SECONDS, TAPS = 8000, 3.0, 32
+PLENTY = 100.0  # times what full control takes
+
+
+def arriving(*samples: int, length: int = 128) -> np.ndarray:
+    """A path that hands on what comes in after so many samples, once for each."""
+    return np.eye(length)[list(samples)].sum(axis=0)
+
+
+@functools.cache
+def noise(seed: int = 1, high: float = 1500.0) -> np.ndarray:
+    return band_limited_noise((100, high), SECONDS, fs=FS, rng=seed, power=1.0)
+
+
+def heard(primary: np.ndarray, other_db: float) -> np.ndarray:
+    """A disturbance with another source, so many dB below what the reference explains."""
+    x = noise()
+    return np.convolve(x, primary)[: x.size] + 10 ** (-other_db / 20) * noise(2)
+
+
+SECONDARY = arriving(6, length=16)
+
+
+def on(x=None, primary=None, secondary=SECONDARY, **options):
+    """The verdict on KF-PB alone, by default on a scene in which nothing is wrong."""
+    options = {"rating": PLENTY, "fs": FS, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None} | options
+    if primary is None and "disturbance" not in options:
+        primary = arriving(20)
+    return assess(noise() if x is None else x, primary, secondary, **options)
+
+
+@functools.cache
+def verdict_on(case: str, better: bool):
+    """The verdict on a scene with one fault, or without it."""
+    primary, secondary, x = arriving(20), SECONDARY, noise()
+    options: dict = {}
+    if case == "coherence":
+        options["disturbance"] = heard(primary, 15.0 if better else 2.0)
+    if case == "causality":
+        x = noise(high=3500.0)  # what a filter hardly predicts
+        primary, secondary = arriving(20 if better else 2), arriving(12, length=16)
+    if case == "filter":
+        primary = arriving(20, 100)
+        options |= {"n_taps": 128 if better else TAPS, "want_db": 8.0}
+    if case == "amplifier":
+        options["rating"] = 0.6 if better else 0.1
+    if case == "adaptation":
+        options |= {"disturbance": heard(primary, 12.0), "want_db": 10.0}
+        options |= {"algorithm": "KF-OPC", "memory_s": 0.25 if better else 0.003}
+    return on(x, primary, secondary, **options)
+
+
+@pytest.mark.parametrize("case", CAUSES)
+def test_a_fault_is_found_as_the_cause_and_without_it_the_same_scene_is_enough(case):
+    verdict = verdict_on(case, better=False)
+    assert not verdict.enough
+    assert verdict.limited_by == case
+    assert verdict.noise_reduction_db < verdict.want_db
+    assert case in verdict.reason.lower()
+    assert verdict.advice
+    assert repr(verdict).startswith(f"Not enough: {verdict.algorithm} reaches")
+    # No ceiling is above the one before. A fit of 32 taps to 1.3 s explains some hundredths of a dB by chance.
+    c = verdict.ceilings
+    known = [value for value in (c.coherence_db, c.time_db, c.filter_db, c.power_db) if value is not None]
+    assert all(later <= earlier + 0.1 for earlier, later in itertools.pairwise(known))
+    jsonschema.validate(strict(verdict.json), strict(SCHEMA.read_text(encoding="utf-8")))
+    better = verdict_on(case, better=True)
+    assert (better.enough, better.limited_by, better.reason) == (True, None, "")
+    assert better.noise_reduction_db >= better.want_db
+    assert repr(better).startswith(f"Enough: {better.algorithm} reaches")
+
+
+def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing():
+    """Noise within the mean power has peaks beyond a sine's: a fixed filter would do, the run does not, with more it does."""
+    small = on(rating=AmplifierRating(ohm=1.0, sine_watt=0.75), want_db=14.0)
+    assert small.ceilings.power_db >= 14.0
+    assert small.limited_by == "amplifier"
+    assert on(rating=AmplifierRating(ohm=1.0, sine_watt=8.0), want_db=14.0).enough
+
+
+def test_a_filter_that_ends_before_the_noise_arrives_is_advised_how_long_it_must_be():
+    """The second arrival comes 94 samples after the loudspeaker's sound and carries half of the energy."""
+    verdict = verdict_on("filter", better=False)
+    assert verdict.response_s == pytest.approx((100 - 6 + 1) / FS)
+    (advice,) = verdict.advice
+    assert advice.startswith(
+        "32 taps last 4 ms, but the noise arrives up to 12 ms later than the loudspeaker's sound: "
+    )
+    assert advice.endswith("resample everything with fs=4000, or take a longer filter with n_taps=128.")
+    assert verdict_on("filter", better=True).noise_reduction_db > 8.0  # with those 128 taps
+    late = replace(verdict, response_s=0.9)  # at 4000 Hz 3600 taps, more than anyone runs
+    assert advice_on(late) == [
+        "32 taps last 4 ms, but the noise arrives up to 900 ms later than the loudspeaker's sound: move the reference "
+        "microphone towards the error microphone, or give a primary path that ends sooner."
+    ]
+
+
+def test_nothing_is_reported_as_minus_zero():
+    verdict = verdict_on("filter", better=False)
+    nothing = replace(verdict, noise_reduction_db=-0.01, ceilings=replace(verdict.ceilings, filter_db=-0.01), advice=())
+    assert "reaches 0.0 dB" in repr(nothing)
+    assert "taps reach 0.0 dB" in repr(nothing)
+
+
+def test_without_a_primary_path_a_short_filter_is_advised_to_be_longer():
+    verdict = on(disturbance=np.convolve(noise(), arriving(12, 30))[: noise().size], n_taps=8)
+    assert verdict.limited_by == "filter"
+    assert verdict.response_s is None
+    assert verdict.advice[0].startswith("Try a filter longer than 8 taps: 8 taps last 1 ms at 8000 Hz, more at a lower")
+
+
+def test_a_tone_is_predicted_so_that_a_late_loudspeaker_does_not_limit():
+    t = np.arange(round(SECONDS * FS)) / FS
+    x = np.sin(2 * np.pi * 300 * t) + 0.01 * np.random.default_rng(0).standard_normal(t.size)
+    verdict = on(x, arriving(2), arriving(12, length=16), want_db=15.0)
+    assert verdict.causality_margin_s < 0
+    assert verdict.enough
+
+
+class Bar:
+    """A progress bar that keeps how far it moved."""
+
+    total: int | None = None
+
+    def __init__(self) -> None:
+        self.moved: list[int] = []
+
+    def update(self, samples: int) -> None:
+        self.moved.append(samples)
+
+    def set_description(self, text: str) -> None:
+        pass
+
+
+def test_the_bar_moves_while_fxlms_is_tuned_and_ends_at_its_total():
+    bar = Bar()
+    on(algorithm="FxLMS", beside=("KF-PB",), bar=bar, want_db=0.0)
+    after_switch_on = round(0.9 * SECONDS * FS)
+    grid = len(STEP_SIZES)
+    assert bar.total == sum(bar.moved) == (2 + grid) * after_switch_on
+    assert bar.moved.count(after_switch_on) >= grid
+
+
+def watts(sine_watt: float) -> AmplifierRating:
+    return AmplifierRating(ohm=8.0, sine_watt=sine_watt, volts_per_unit=3.0)
+
+
+@pytest.mark.parametrize(("kind", "algorithm"), [(float, "KF-PB"), (watts, "KF-PB"), (watts, "FxLMS")])
+def test_the_least_rating_is_one_answer_whatever_is_typed_and_typed_back_it_is_just_enough(kind, algorithm):
+    def on(rated: float):
+        options: dict = {"algorithm": algorithm, "beside": (), "secondary_path_uncertainty": None, "n_taps": TAPS}
+        return assess(noise(), arriving(20), arriving(6, length=16), rating=kind(rated), fs=FS, want_db=8.0, **options)
+
+    few, many = on(0.01), on(1000.0)
+    assert (few.limited_by, many.enough) == ("amplifier", True)
+    assert few.least_rated_power == pytest.approx(many.least_rated_power, rel=1e-12)
+    printed = float(re.search(r"About (?:a rated power of )?(\S+) ", few.advice[0])[1])
+    assert many.advice == few.advice[:1]
+    assert on(printed).enough
+    assert not on(0.98 * printed).enough
+
+
+def test_the_advice_on_causality_is_a_delay_that_helps():
+    verdict = verdict_on("causality", better=False)
+    more = round(verdict.helpful_delay_s * FS)
+    helped = on(noise(high=3500.0), arriving(2 + more), arriving(12, length=16))
+    assert helped.ceilings.filter_db >= verdict.want_db
+    assert verdict.causality_margin_s == pytest.approx(-10 / FS)
+
+
+def test_an_excursion_limit_lowers_the_rated_power_until_it_is_kept():
+    curve = (np.array([100.0, 300.0, 1500.0]), np.array([2.0, 1.0, 0.05]))
+
+    def with_excursion(x_max: float):
+        loudspeaker = LoudspeakerRating(8.0, x_max_mm=x_max, displacement_mm_per_volt=curve)
+        return on(rating=[AmplifierRating(ohm=8.0, sine_watt=0.1), loudspeaker]), loudspeaker
+
+    verdict, loudspeaker = with_excursion(0.5)
+    assert verdict.limits.decided_by == "loudspeaker's excursion"
+    assert verdict.limits.rated_power < 0.8
+    y = verdict.runs["KF-PB"].control_signal
+    moved = loudspeaker.displacement_mm(y[y.size // 2 :], FS)
+    assert np.sqrt(np.mean(moved**2)) <= 0.5 / 2.0 * 1.02
+    assert verdict.excursion_mm > 0
+    free, _ = with_excursion(50.0)
+    assert free.limits.decided_by == "amplifier"
+    assert free.limits.rated_power == pytest.approx(0.8)
+
+
+# What it writes.
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("verdict") / "out"
+    rating = AmplifierRating(ohm=8.0, sine_watt=2.0, volts_per_unit=10.0)
+    verdict = assess(noise(), arriving(20), SECONDARY, rating=rating, fs=FS, n_taps=TAPS, pascal_per_unit=1.0)
+    return verdict, verdict.write(folder)
+
+
+def strict(text: str):
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_the_json_is_strict_and_as_its_schema_says(written):
+    verdict, page = written
+    schema = strict(SCHEMA.read_text(encoding="utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    data = strict((page.parent / "verdict.json").read_text(encoding="utf-8"))
+    jsonschema.validate(data, schema)
+    assert data == verdict.to_dict()
+    assert data["enough"] is verdict.enough
+    assert set(data["algorithms"]) == {"KF-PB", "KF-OPC", "FxLMS"}
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data | {"surprise": 1}, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data | {"limited_by": "bad luck"}, schema)
+
+
+def test_the_page_says_where_it_comes_from_and_no_watts_that_are_not_known(tmp_path):
+    known, unknown = (on(rating=AmplifierRating(8.0, 2.0, volts_per_unit=volts), want_db=1.0) for volts in (4.0, None))
+    named = replace(unknown, origin={"Files": "<a>.wav, 24000 samples"})
+    pages = [verdict.write(tmp_path).read_text(encoding="utf-8") for verdict in (known, named)]
+    assert known.limits.rated_power == unknown.limits.rated_power / 16 == 1.0
+    assert "with 2 W into 8 ohm" in known.verdict
+    for told in ("Power (W into 8 ohm)", ">4 V<", f"kfopc_filterpy {__version__}", str(date.today()), "8000 Hz"):
+        assert told in pages[0]
+    assert not re.search(r"\d W\b|\(W", re.sub(r"data:[^\"]*", "", pages[1]))
+    for told in ("not watts: volts_per_unit is not known", "&lt;a&gt;.wav, 24000 samples"):
+        assert told in pages[1]
+    for text in pages:
+        assert not re.search(r'(?:href|src)="(?:https?:)?//', text)
+        assert all(source.startswith("data:") for source in re.findall(r'src="([^"]{0,40})', text))
+        assert all((tmp_path / stem).is_file() for stem in re.findall(r'href="([^"#]+)"', text))
+
+
+@pytest.mark.parametrize(
+    ("rating", "algorithm", "other", "why"),
+    [
+        (PLENTY, "FxLMS", "KF-OPC", "dB within the rating: choose it as the algorithm."),
+        (0.1, "KF-PB", "FxLMS", "dB, but does not keep the rating: its mean power is"),
+    ],
+)
+def test_a_controller_that_did_better_is_chosen_or_the_verdict_says_why_not(rating, algorithm, other, why):
+    options: dict = {"fs": FS, "n_taps": TAPS, "beside": (other,), "want_db": 0.0}
+    verdict = assess(noise(), arriving(20), arriving(6, length=16), rating=rating, algorithm=algorithm, **options)
+    reached = {name: figures["noise_reduction_db"] for name, figures in verdict.figures.items()}
+    assert reached[other] > reached[algorithm] + 0.1
+    assert any(note.startswith(f"{other}, as published, reaches {reached[other]:.1f} {why}") for note in verdict.notes)
+
+
+def test_the_levels_are_those_of_the_sounds(written):
+    verdict, _ = written
+    run = verdict.runs["KF-PB"]
+    half = run.disturbance[run.n_samples // 2 :]
+    whole = 10 * np.log10(np.sum(10 ** (verdict.levels.before_db / 10)))
+    assert whole == pytest.approx(10 * np.log10(np.mean(half**2) / 4e-10), abs=0.3)
+    less = verdict.levels.before_dba - verdict.levels.after_dba
+    assert less == pytest.approx(verdict.noise_reduction_db, abs=3.0)  # the noise is where A is flat within 3 dB or so
+
+
+def test_a_third_octave_that_the_control_makes_louder_is_noted():
+    """A white reference explains a disturbance of one band; a short filter adds noise beside it."""
+    x = np.random.default_rng(0).standard_normal(3 * FS)
+    verdict = on(x, firwin(41, [400, 900], pass_zero=False, fs=FS), arriving(8, length=16))
+    note = next(note for note in verdict.notes if "third octaves louder" in note)
+    count, centre, more = re.match(r"KF-PB makes (\d+) of \d+ .* at (\d+) Hz: by ([\d.]+) dB\.", note).groups()
+    run = verdict.runs["KF-PB"]
+    half = np.array([run.error, run.disturbance])[:, run.n_samples // 2 :]
+    f, spectra = welch(half, FS, nperseg=2048)
+    band = (f > int(centre) * 2 ** (-1 / 6)) & (f < int(centre) * 2 ** (1 / 6))
+    after, before = spectra[:, band].sum(axis=1)
+    assert float(more) == pytest.approx(10 * np.log10(after / before), abs=1.0)  # their filters' flanks differ
+    assert int(count) > 1
+    assert not any("louder" in note for note in on().notes)
+
+
+# What it refuses.
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"noise": np.ones(8000)}, "noise must not be silent"),
+        ({"noise": np.full(8000, np.nan)}, "noise must be finite"),
+        ({"secondary": np.zeros(8)}, "secondary must not be silent: every value is 0; record it again"),
+        ({"primary": None}, "primary must be given unless there is a disturbance"),
+        ({"disturbance": noise()}, "channel 0 of disturbance is channel 0 of noise, sample for sample"),
+        ({"disturbance": np.ones(7)}, "disturbance must have 24000 values, got 7"),
+        (
+            {"noise": noise()[:16000].reshape(2, 8000)},
+            "primary must be (K microphones, I references, taps) = (1, 2, taps)",
+        ),
+        ({"noise": Recording(noise(), 2 * FS)}, f"noise is sampled at {2 * FS} Hz but fs is {FS} Hz"),
+        ({"rating": 0.0}, "rating must be greater than 0"),
+        ({"algorithm": "KF"}, "algorithm must be one of 'KF-PB', 'KF-OPC', 'FxLMS'"),
+        ({"want_db": -1.0}, "want_db must not be negative"),
+        ({"switch_on_s": 3.0}, "switch_on_s must be within the 3 s"),
+        ({"switch_on_s": 1.1}, "noise must last 2 s after the control is switched on, got 1.9 s"),
+        ({"n_taps": 12000}, "must have at least"),
+        ({"pascal_per_unit": 0.0}, "pascal_per_unit must be greater than 0"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_bad_input_is_refused(change, message):
+    good = {"noise": noise(), "primary": arriving(20), "secondary": SECONDARY, "rating": 1.0, "n_taps": 16}
+    with pytest.raises(ValueError, match=re.escape(message)):
+        assess(fs=FS, **good | change)
