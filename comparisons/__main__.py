@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 
 from kfopc_filterpy._writing import prepare_folder
@@ -23,8 +22,8 @@ def _study(module: str, main: str = "main") -> Study:
     return getattr(own, main), own.planned_runs
 
 
-SPEED = "speed"
 ALONE = {  # with options of their own
+    "speed": ".speed.study",
     "sweep": ".sweep.command",
     "soak": ".soak.study",
     "board": ".board.study",
@@ -51,22 +50,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="*",
         metavar="STUDY",
         help=f"{', '.join(STUDIES)}, by default all of these; beyond the paper: {', '.join(FURTHER)}; "
-        "speed, which times the filter against others; board, which runs exported controllers on an emulated microcontroller; "
+        "speed, which times the filter beside others; board, which runs exported controllers on an emulated microcontroller; "
         "sweep, which runs a grid; soak, which runs controllers for very long; or benchmark, which scores them and others "
-        "on the same tasks; the last three have options of their own (sweep --help)",
+        "on the same tasks; these have options of their own (sweep --help)",
     )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
-    known = (*STUDIES, *FURTHER, SPEED, *ALONE)
+    known = (*STUDIES, *FURTHER, *ALONE)
     for name in ALONE:
         if name in options.studies:
             parser.error(f"{name} runs alone, and is named first: its options follow it")
     unknown = [name for name in options.studies if name not in known]
     if unknown:
         parser.error(f"no study called {', '.join(unknown)}; there are {', '.join(known)}")
-    if SPEED in options.studies and len(options.studies) > 1:
-        parser.error(f"{SPEED} runs alone: other work beside it would be timed too")
 
     import matplotlib
     from tqdm import tqdm
@@ -76,8 +73,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prepare_folder(options.output)
     except OSError as error:
         parser.error(str(error))
-    if SPEED in options.studies:
-        return _speed(parser, options)
     began = time.perf_counter()
     reports: list[StudyReport] = []
     left_out: list[str] = []
@@ -101,14 +96,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(results_table(reports))
     print(f"\n{page}, with notes and all tables, and results.json written in {time.perf_counter() - began:.0f} s")
     return 0
-
-
-def _speed(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
-    if find_spec("threadpoolctl") is None:
-        parser.error('speed needs the extra bench: python -m pip install -c constraints.txt -e ".[bench]"')
-    from .speed import study as speed
-
-    return speed.main(options.output, options.quiet)
 
 
 if __name__ == "__main__":

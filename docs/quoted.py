@@ -5,7 +5,7 @@ and fails if a page says something else. It skips studies that are not in the fo
 
 A `Quote` is a sentence of a page with a format field for each number, and a function that computes the numbers from the
 results. Numbers in examples and tutorials need no list, because they are executed. Nor do the times in speed.txt: they are
-the output of ``python -m comparisons speed --quiet`` and depend on the machine.
+the output of ``python -m comparisons speed`` and depend on the machine.
 """
 
 from __future__ import annotations

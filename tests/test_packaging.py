@@ -27,7 +27,7 @@ README_COMMANDS = [
     f'{SET_UP} ".[docs]" && .venv/bin/python -m sphinx -W -j auto docs docs/_build/html',
 ]
 # Extras and groups that the tests run without.
-NOT_FOR_TESTS = ("bench", "benchmark", "docs", "fmu", "realtime", "coverage", "dev", "lint", "mutants")
+NOT_FOR_TESTS = ("benchmark", "docs", "fmu", "realtime", "coverage", "dev", "lint", "mutants")
 LOADED_WHEN_FIRST_USED = ("jinja2", "control", "h5py", "matplotlib", "pooch", "pyuff", "soundfile", "tqdm")
 
 

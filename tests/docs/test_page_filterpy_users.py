@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
@@ -94,13 +92,3 @@ def test_the_bank_notices_the_manoeuvre(recipe):
 def test_a_filter_that_refuses_goes_on(recipe):
     assert recipe.printed.count("z must") == 3
     assert "and on it goes: [0.5 0. ]" in recipe.printed
-
-
-def test_it_shows_two_rows_of_the_table_on_speed():
-    text = (TUTORIALS / "filterpy_users.md").read_text(encoding="utf-8")
-    chosen = re.search(r"\.\./speed\.txt\n:language: text\n:lines: (.*)", text)[1]
-    lines = (TUTORIALS.parent / "speed.txt").read_text(encoding="utf-8").splitlines()
-    shown = [
-        line for item in chosen.split(", ") for line in lines[int(item.split("-")[0]) - 1 : int(item.split("-")[-1])]
-    ]
-    assert [line[:20].strip() for line in shown] == ["µs a sample", "filterpy API of KFOP", "filterpy"]

@@ -27,13 +27,6 @@ def test_the_words_of_every_quote_stand_on_their_page():
         assert quote.found() is not None, f"{quote.page} does not say: {quote.words}"
 
 
-def test_the_page_on_speed_shows_the_output_of_its_command():
-    assert "{literalinclude} speed.txt" in (DOCS / "speed.md").read_text(encoding="utf-8")
-    printed = (DOCS / "speed.txt").read_text(encoding="utf-8")
-    assert printed.startswith("µs a sample")
-    assert "dgemm, one thread: " in printed
-
-
 @pytest.mark.parametrize("page", ["constraint.md", "limits.md", "theory.md", "symbols.md"])
 def test_every_figure_in_decibels_is_on_the_list(page):
     text = (DOCS / page).read_text(encoding="utf-8")

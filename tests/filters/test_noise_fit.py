@@ -1,4 +1,4 @@
-"""Noises by maximum likelihood: the joint density of the record, statsmodels, closed forms, known truths."""
+"""Noises by maximum likelihood: the joint density of the record, closed forms, known truths."""
 
 from __future__ import annotations
 
