@@ -18,7 +18,6 @@ from kfopc_filterpy import (
     OutputPowerConstraint,
     SimulationResult,
     kf_opc,
-    kf_opc_repaired,
     kf_pb,
     noise_reduction_db,
     output_power,
@@ -55,11 +54,10 @@ class WeakLoudspeaker:
         )
 
     def runs(self) -> dict[str, SimulationResult]:
-        """Return the runs of three controllers of the same rated power."""
+        """Return the runs of two controllers of the same rated power."""
         settings: dict[str, Any] = {"state_noise": 1e-9, "measurement_noise": 1e-3, "initial_variance": 0.1}
         controllers = (
             kf_opc(160, self.secondary, rated_power=RATED_POWER, **settings),
-            kf_opc_repaired(160, self.secondary, rated_power=RATED_POWER, **settings),
             kf_pb(160, self.secondary, rated_power=RATED_POWER),
         )
         results = (

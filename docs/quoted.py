@@ -345,7 +345,7 @@ def _constraint() -> Iterator[Quote]:
     def quote(words: str, numbers: Callable[[Results], Sequence[float]], page: str = "constraint.md") -> Quote:
         return Quote(page, words, ("constraint",), numbers, CONSTRAINT)
 
-    for name in ("KF-OPC", "KF-OPC repaired", "KF-PB"):
+    for name in ("KF-OPC", "KF-PB"):
         line = "{:.2f}-{:.2f} | {:.2f} ({:.2f}) dB | {:.2f}-{:.2f} | {:.2f} ({:.2f}) dB | {:.1f} |"
         yield quote(f"| {name} | {line}", lambda r, name=name: r.summary(name))
     yield quote(
@@ -374,7 +374,6 @@ TABLED = (
     "scaled Wiener",
     "KF-PB",
     "KF-OPC",
-    "KF-OPC repaired",
     "diagonal KF-OPC",
     "leaky FxLMS",
     "optimal leaky FxLMS",
@@ -386,7 +385,6 @@ TABLED = (
     "re-scaling FxLMS",
     "clipping FxLMS",
     "power-limited FxLMS",
-    "band-limited FxLMS",
 )
 TABLED_DB = -6.0
 

@@ -33,7 +33,6 @@ from .bounds.settings import suggest_settings as suggest_settings
 from .controllers.band_limited import BandLimitedFxLMS as BandLimitedFxLMS
 from .controllers.clipping import ClippingFxLMS as ClippingFxLMS
 from .controllers.diagonal import DiagonalKalman as DiagonalKalman
-from .controllers.fast_array import FastArrayKalman as FastArrayKalman
 from .controllers.frequency_domain import FrequencyDomainFxLMS as FrequencyDomainFxLMS
 from .controllers.frequency_kalman import FrequencyDomainKalman as FrequencyDomainKalman
 from .controllers.fxlms import FxLMS as FxLMS
@@ -47,7 +46,6 @@ from .controllers.leaky import OptimalLeakyFxLMS as OptimalLeakyFxLMS
 from .controllers.limited import LimitedController as LimitedController
 from .controllers.mov import MOVFxLMS as MOVFxLMS
 from .controllers.power_budget import kf_pb as kf_pb
-from .controllers.repaired import kf_opc_repaired as kf_opc_repaired
 from .controllers.rescaling import RescalingFxLMS as RescalingFxLMS
 from .controllers.subband import SubbandFxLMS as SubbandFxLMS
 from .controllers.two_gradient import TwoGradientFxLMS as TwoGradientFxLMS

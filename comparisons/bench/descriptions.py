@@ -7,7 +7,6 @@ from collections.abc import Iterable
 DESCRIPTIONS = {
     "KF-ANC": "a Kalman filter that learns the control filter and knows no rated power",
     "KF-OPC": "KF-ANC with the disturbance scaled by a constraint factor, which is meant to keep the rated power",
-    "KF-OPC repaired": "KF-OPC with the secondary path's gain for the control signal, trimmed by the measured power",
     "KF-PB": "a Kalman filter that learns the paths, keeps the rated power, and spends it where it reduces the noise most",
     "diagonal KF": "KF-ANC that leaves out how the weights' errors depend on each other; it computes and learns less",
     "diagonal KF-OPC": "the diagonal KF with KF-OPC's constraint factor",
@@ -25,7 +24,6 @@ DESCRIPTIONS = {
     "clipping FxLMS": "FxLMS whose control signal is clipped at an amplitude limit",
     "frequency-domain FxLMS": "FxLMS that adapts once per block, each frequency at its own rate; it knows no rated power",
     "power-limited FxLMS": "frequency-domain FxLMS with a price on the output power that follows the measured power",
-    "band-limited FxLMS": "the same with a limit and a price for each octave, by the reference's power in it",
 }
 
 

@@ -180,18 +180,6 @@ def _within_power(scene: Scene, mu: float, _: float) -> dict[str, Any]:
     return _in_blocks(scene, mu, np.nan) | limits
 
 
-def _within_bands(scene: Scene, mu: float, _: float) -> dict[str, Any]:
-    """Divide the rated power among octaves as the reference divides its own: the control filter's gain has one limit."""
-    settings = _in_blocks(scene, mu, np.nan)
-    octaves = min(int(np.log2((settings["block_size"] + settings["partition_size"]) / 2)), 6)  # none below the bins
-    edges = np.append(0.0, scene.fs / 2 * 2.0 ** np.arange(-octaves, 1))
-    spectrum = np.abs(np.fft.rfft(scene.settled[0])) ** 2
-    bands = np.histogram(np.linspace(0.0, scene.fs / 2, spectrum.size), edges, weights=spectrum)[0]
-    # Less than this cannot be measured beside a loud band, as the window lets some of its power through.
-    shares = np.maximum(bands / bands.sum(), 1e-3)
-    return settings | {"band_edges": edges, "band_powers": scene.rated_power * shares, "fs": scene.fs}
-
-
 def _constrained(settings: Settings) -> Settings:
     """Return a function that adds the scene's constraint, or one for each loudspeaker, to `settings`."""
 
@@ -243,7 +231,6 @@ REGISTRY: dict[str, Algorithm] = {
     "KF-OPC": _made_by(
         "KF-OPC", _constrained(_random_walk), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_CHANNELS
     ),
-    "KF-OPC repaired": _made_by("KF-OPC repaired", _constrained(_random_walk), **_RANDOM_WALK),
     "KF-PB": _made_by("KF-PB", _power_budget, **_BUDGET, **_CHANNELS),
     "diagonal KF": _made_by("diagonal KF", _random_walk, **_DIAGONAL, **_FREE),
     "diagonal KF-OPC": _made_by("diagonal KF", _constrained(_random_walk), **_DIAGONAL),
@@ -261,7 +248,6 @@ REGISTRY: dict[str, Algorithm] = {
     "clipping FxLMS": _made_by("clipping FxLMS", _peak, **_PEAK, **_CHANNELS),
     "frequency-domain FxLMS": _made_by("frequency-domain FxLMS", _in_blocks, **_BLOCKS, **_FREE),
     "power-limited FxLMS": _made_by("band-limited FxLMS", _within_power, **_BLOCKS),
-    "band-limited FxLMS": _made_by("band-limited FxLMS", _within_bands, **_BLOCKS),
 }
 
 

@@ -35,7 +35,6 @@ SAMPLES = 10_000_000
 CHECKS = 20  # in a run
 FS = 16000.0
 TAPS = 32
-MEMORY = 100 * TAPS  # of the finite-memory fast array
 SENSOR_NOISE = 1e-2  # standard deviation; the measurement noise q is its variance
 Q = SENSOR_NOISE**2
 RATED_POWER = 0.5  # a quarter of what full control of white noise needs
@@ -48,8 +47,6 @@ LARGEST_GROWTH_MB = 16.0  # of the process, from the second check to the last: 1
 LOUDER_DB = 1.0
 INTERRUPTED = 130  # what shells give a command that Ctrl-C ended
 POWER_TOLERANCE = 1e-9  # of a limiter's window, relative
-
-ARRAYS = GROWING, FINITE = "fast-array KF", "finite-memory fast-array KF"
 
 Take = Callable[[int], np.ndarray]
 
@@ -148,7 +145,6 @@ def all_cases() -> list[Case]:
     rated: dict[str, Any] = {"rated_power": RATED_POWER}
     limit: dict[str, Any] = {"amplitude_limit": 1.0}
     zero: dict[str, Any] = {"state_noise": 0.0, "measurement_noise": Q, "initial_variance": 1e12 * Q}
-    array = partial(anc.FastArrayKalman, TAPS, SECONDARY, measurement_noise=Q)
     paths = several_channels()
     lms: dict[str, tuple[Any, dict[str, Any]]] = {
         "FxLMS": (anc.FxLMS, {}),
@@ -167,9 +163,6 @@ def all_cases() -> list[Case]:
         Case("KF-PB", partial(anc.kf_pb, TAPS, SECONDARY, **rated)),
         kalman_case("diagonal KF", anc.DiagonalKalman, 1e12),
         Case("KF-ANC, 2 x 2", partial(anc.kf_anc, TAPS // 2, paths, **zero), ratio=1e12, secondary=paths, share=0.1),
-        # The other noises spoil an array that is never restarted.
-        Case(GROWING, partial(array, initial_variance=1e4 * Q), ratio=1e4, signals=("tone", "silence", "white")),
-        *(Case(FINITE, partial(array, initial_variance=r * Q, memory=MEMORY), ratio=r) for r in (1e4, 1e12)),
         *(
             Case(name, partial(make, TAPS, SECONDARY, step_size=1e-3, **settings), quiet=name != "clipping FxLMS")
             for name, (make, settings) in lms.items()
@@ -193,8 +186,6 @@ class Outcome:
     least_eigenvalue: float = np.nan  # over the largest; the least of all checks
     largest_weight: float = 0.0
     growth_mb: float = 0.0
-    arrays_lost: int | None = None
-    stray: float | None = None  # the largest at any check
     violations: list[tuple[int, str]] = field(default_factory=list)  # sample, what
 
 
@@ -322,9 +313,6 @@ def soak(case: Case, signal: str, samples: int, tick: Callable[[int], Any] = lam
             outcome.least_eigenvalue = float(np.fmin(outcome.least_eigenvalue, least))
             faults += of_P
         outcome.largest_weight = max(outcome.largest_weight, float(np.max(np.abs(controller.weights))))
-        if hasattr(controller, "stray"):
-            outcome.stray = max(outcome.stray or 0.0, controller.stray)
-            outcome.arrays_lost = controller.arrays_lost
         if signal != "silence":
             outcome.noise_reduction_db = reduction_db(result)
         del result
@@ -362,21 +350,10 @@ def table(outcomes: Sequence[Outcome]) -> str:
 def remarks(outcomes: Sequence[Outcome]) -> list[str]:
     """Return what the table does not say."""
     longest = max(one.samples for one in outcomes)
-    arrays = [one for one in outcomes if one.stray is not None]
-    growing, finite = (
-        min([one.us_per_sample for one in arrays if one.name == name], default=np.nan) for name in ARRAYS
-    )
     lines = [
         f"{len(outcomes)} runs of {longest:,} samples (several channels: a tenth), {CHECKS} checks in each, "
         f"{TAPS} taps, no state noise, q = {Q:g}. dB: noise reduction in the last interval; least/largest: eigenvalues of "
         "P, the worst of all checks; MB: growth of the process; us: time of a sample, the least of the noises."
-    ]
-    if growing > 0.0 < finite:
-        lines.append(f"A finite memory of {MEMORY} takes {finite / growing:.1f} times as long as one fast array.")
-    lines += [
-        f"{one.name}, P0/q = {one.ratio:.0e}, {one.signal}: largest stray of the arrays {one.stray:.1e}, "
-        f"{one.arrays_lost} arrays lost and restarted."
-        for one in arrays
     ]
     violations = ((one, sample, what) for one in outcomes for sample, what in one.violations)
     return lines + [f"VIOLATION: {one.name}, {one.signal}, by sample {n:,}: {what}." for one, n, what in violations]

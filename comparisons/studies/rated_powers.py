@@ -29,13 +29,13 @@ CASES = (
 )
 BOUND, RECORD, SCALED = "bound", "bound of the record", "scaled Wiener"  # the first, of each second if that varies
 PANELS = {
-    "Kalman filters": ("KF-OPC", "KF-OPC repaired", "KF-PB", "diagonal KF-OPC"),
+    "Kalman filters": ("KF-OPC", "KF-PB", "diagonal KF-OPC"),
     "FxLMS with a price": (
         *("leaky FxLMS", "optimal leaky FxLMS"),
         *("MOV-FxLMS fixed", "MOV-FxLMS by variance", "MOV-FxLMS", "MOV-MFxLMS"),
     ),
     "FxLMS with an amplitude limit": ("two-gradient FxLMS", "re-scaling FxLMS", "clipping FxLMS"),
-    "FxLMS in the frequency domain": ("power-limited FxLMS", "band-limited FxLMS"),
+    "FxLMS in the frequency domain": ("power-limited FxLMS",),
 }
 
 TunedAt = Mapping[float, Mapping[str, Tuned]]  # by rated power and algorithm

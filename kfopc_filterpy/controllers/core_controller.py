@@ -365,8 +365,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         :math:`E[(d - w^T x')^2] + E[(w^T x'')^2]` with :math:`x'' = W * x'` and the filter W of `paths.guard_filter`: an
         LMS algorithm gets a leak shaped in frequency, which also limits its step size, and a Kalman filter gets a
         second observation. An uncertainty can be assigned for KF-ANC, KF-OPC, the diagonal Kalman filter and the LMS
-        family, with one channel or several; not for the fast-array filter, which takes one observation. `kf_pb` takes
-        it as a setting, which cannot be changed, and learns the path.
+        family, with one channel or several. `kf_pb` takes it as a setting, which cannot be changed, and learns the path.
         """
         return deepcopy(self._uncertainty)
 

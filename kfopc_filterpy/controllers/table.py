@@ -9,7 +9,6 @@ from typing import Any
 from .band_limited import BandLimitedFxLMS
 from .clipping import ClippingFxLMS
 from .diagonal import DiagonalKalman
-from .fast_array import FastArrayKalman
 from .frequency_domain import FrequencyDomainFxLMS
 from .fxlms import FxLMS
 from .fxnlms import FxNLMS
@@ -18,7 +17,6 @@ from .kalman import kf_anc, kf_opc
 from .leaky import LeakyFxLMS, OptimalLeakyFxLMS
 from .mov import MOVFxLMS
 from .power_budget import kf_pb
-from .repaired import kf_opc_repaired
 from .rescaling import RescalingFxLMS
 from .two_gradient import TwoGradientFxLMS
 
@@ -26,10 +24,8 @@ from .two_gradient import TwoGradientFxLMS
 CORE: dict[str, Callable[..., Any]] = {
     "KF-ANC": kf_anc,
     "KF-OPC": kf_opc,
-    "KF-OPC repaired": kf_opc_repaired,
     "KF-PB": kf_pb,
     "diagonal KF": DiagonalKalman,
-    "fast-array KF": FastArrayKalman,
     "FxRLS": fx_rls,
     "FxLMS": FxLMS,
     "FxNLMS": FxNLMS,

@@ -21,16 +21,13 @@ _EACH = ("", "loudspeakers", "microphones")
 _step = ctypes.PYFUNCTYPE  # keeps the interpreter's lock
 
 # What a step that was refused says: `anc_answer` in anc.h. Nothing was changed then.
-LOUD_REFERENCE, LOUD_ERROR, LOUD_ESTIMATE, LOUD_STEP, NO_SOLUTION, LOST_ARRAY = range(1, 7)
+LOUD_REFERENCE, LOUD_ERROR, LOUD_ESTIMATE, LOUD_STEP, NO_SOLUTION = range(1, 6)
 REASONS = {
     LOUD_REFERENCE: "the reference is too loud, above 1e25 over the gain of the secondary path: scale the signals",
     LOUD_ERROR: "the error is too loud, above 1e100: scale the signals",
     LOUD_ESTIMATE: "the disturbance estimate e + s^ * y is too loud, above 1e100, or 1e20 with an internal model: scale the signals",
     LOUD_STEP: "the step of the weights is too large, above 1e50: use a smaller step size",
     NO_SOLUTION: "the covariance P is too large: S = x' P x' + q could overflow",
-    LOST_ARRAY: "the fast array is lost to rounding, or to a reference that was too loud: with the next sample it begins "
-    "again at these weights. Use memory= instead of a forgetting factor, or kf_anc, whose O(L^2) form does not lose its "
-    "covariance",
 }
 
 

@@ -1,11 +1,21 @@
 /* KF-ANC and KF-OPC: eq. 2-9 of Ji et al. with the factor of eq. 10-13, and FxRLS, which is the same with a fading
  * memory. */
-#include "kalman.h"
+#include "covariance.h"
 #include <string.h>
 
-static const anc_setting kalman_settings[] = {KALMAN_SETTINGS_LISTED, {0}};
+typedef struct {
+    signals s;
+    covariance c;
+    real *scaled;                /* (S, K) alpha d^, the measurements */
+    real *innovation, *variance; /* (S, K) and (K), S of eq. 7, of the last sample */
+} kalman;
 
-void layout_kalman(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
+enum { STATE_NOISE, MEASUREMENT_NOISE, INITIAL_VARIANCE, FADING };
+static const anc_setting kalman_settings[] = {
+    {"state_noise", 0, 0, ANC_ONE}, {"measurement_noise", 0, 0, ANC_EACH_MICROPHONE}, {"initial_variance", 0, 0, ANC_ONE},
+    {"fading", 1, 1e30f, ANC_ONE}, {0}};
+
+static void layout_kalman(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
 {
     kalman *f = (kalman *)view;
     layout_signals(&f->s, plan, settings, at);
@@ -15,7 +25,7 @@ void layout_kalman(anc_view *view, const anc_plan *plan, const anc_setting *sett
     f->variance = reals(at, "innovation_variance", ANC_STATE, 1, 1, 1, f->s.K);
 }
 
-void start_kalman(anc_view *view, const anc_plan *plan, const anc_setting *settings)
+static void start_kalman(anc_view *view, const anc_plan *plan, const anc_setting *settings)
 {
     kalman *f = (kalman *)view;
     start_signals(&f->s, plan, settings);
@@ -29,7 +39,8 @@ static void observe(kalman *f, const lines *rows, int32_t k)
     for (int32_t ji = 0; ji < n; ji++) memcpy(f->c.h + times(ji, f->s.L), newest(rows, k * n + ji), sizeof(real) * (size_t)f->s.L);
 }
 
-/* Measure z at microphone k: eq. 5-9 for every scenario, with one gain. */
+/* Measure z at microphone k: eq. 5-9 for every scenario, with one gain. The microphones' noises are independent, so they
+ * are measured one after the other. */
 static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
 {
     const int32_t K = f->s.K;
@@ -46,7 +57,8 @@ static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
     }
 }
 
-int correct_weights(kalman *f)
+/* Eq. 2-9 with the measurements in `scaled`, after `estimate`; commits. */
+static int correct_weights(kalman *f)
 {
     signals *s = &f->s;
     const real fading = *s->setting[FADING], state_noise = *s->setting[STATE_NOISE];

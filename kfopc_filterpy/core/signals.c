@@ -51,7 +51,7 @@ static void layout_all(signals *s, const anc_plan *p, const anc_setting *setting
 {
     const int32_t S = p->scenarios, K = p->microphones, J = p->loudspeakers, I = p->references;
     const int32_t L = p->taps, M = p->path_taps, G = p->guard_taps;
-    const int32_t filtered = L < ANC_GUARD_TAPS ? ANC_GUARD_TAPS : L + 1; /* for a later guard; for a fast array */
+    const int32_t filtered = L < ANC_GUARD_TAPS ? ANC_GUARD_TAPS : L; /* for a later guard */
     s->S = S, s->K = K, s->J = J, s->I = I, s->L = L, s->M = M, s->G = G;
     s->limited = p->limited, s->modelled = p->modelled ? K : 0;
     s->power_length = longest(p->power_windows, S * J), s->limiter_length = longest(p->limiter_windows, S * J);

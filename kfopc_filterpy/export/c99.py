@@ -101,8 +101,8 @@ def export_c(
     Parameters
     ----------
     controller : CoreController
-        One whose algorithm is in the core, such as the FxLMS family, `DiagonalKalman`, `FastArrayKalman`, or what
-        `kf_anc`, `kf_opc`, `kf_pb`, `fx_rls` and `kf_opc_repaired` return, with whatever it has: several channels,
+        One whose algorithm is in the core, such as the FxLMS family, `DiagonalKalman`, or what
+        `kf_anc`, `kf_opc`, `kf_pb` and `fx_rls` return, with whatever it has: several channels,
         limiters, amplifier models, an uncertain secondary path, sliding windows. It is not changed.
     path : str or pathlib.Path
         Source file to write, ending in ``.c``; its header, ending in ``.h``, is written beside it. Or a folder, which is

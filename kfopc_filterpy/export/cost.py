@@ -7,10 +7,9 @@ import numpy as np
 from ..core.block import Block
 from ..core.run_loop import SOFT_SATURATION
 
-KALMAN = ("kalman", "repaired")
 OF_POWERS, OF_LIMITER, OF_SOFT_AMPLIFIER = 12, 43, 150  # multiplications for each loudspeaker
-# Multiplications per weight, beyond those of y: for each row of x' that a sample learns from, or in all.
-OF_EACH_ROW = {"diagonal": 8, "fast_array": 14, "finite_memory": 28}
+# Multiplications per weight, beyond those of y: of the diagonal filter for each row of x' that a sample learns from, or in all.
+OF_DIAGONAL = 8
 IN_ALL = {"leaky": 2, "optimal_leaky": 2, "mov": 2, "mov_fixed": 2}
 
 
@@ -25,10 +24,10 @@ def operations(block: Block) -> str:
         return f"{filtering:,} multiplications and as many additions, and once in a block the work of the block"
     filtering += K * J * (M * (s.references + 1) + s.guard_taps * s.references) + J * OF_POWERS
     rows = K * (1 + guarded)
-    if algorithm in KALMAN:
+    if algorithm == "kalman":
         learning = rows * (3 * n * n // 2 + 12 * n)
-    elif algorithm in OF_EACH_ROW:
-        learning = rows * n * OF_EACH_ROW[algorithm]
+    elif algorithm == "diagonal":
+        learning = rows * n * OF_DIAGONAL
     else:
         learning = n * (K * (3 if guarded else 1) + IN_ALL.get(algorithm, 0))
         if algorithm == "fxnlms":
@@ -44,7 +43,7 @@ def worst(block: Block) -> str:
     parts = ["one that moves the samples of the delay lines"]
     if windows:
         parts.append(f"every {max(windows):,}th, in which the limiter adds up its window")
-    if algorithm in KALMAN:
+    if algorithm == "kalman":
         parts.append(
             "one whose innovation variance exceeds 1000 times the measurement noise, mostly soon after the start, which "
             "updates P in twice the precision"

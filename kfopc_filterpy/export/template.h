@@ -17,9 +17,9 @@
  *
  * Bad input: a reference or an error that is NaN, infinite or too loud to be squared and filtered without overflow. A
  * bad reference counts as 0, and ${name}_update refuses that sample. It also refuses a disturbance estimate e + s^ * y
- * that is too loud, a step of the weights that is too large, a covariance so large that the next one could overflow
- * (${NAME}_NO_SOLUTION), and a fast array that is lost to rounding. A refused update changes no weight. An output is
- * never NaN or infinite: if the weights have grown that much, it is 0.
+ * that is too loud, a step of the weights that is too large, and a covariance so large that the next one could overflow
+ * (${NAME}_NO_SOLUTION). A refused update changes no weight. An output is never NaN or infinite: if the weights have
+ * grown that much, it is 0.
  *
  * A state that was never initialised, zeroed or not, or that is of another export, is initialised by its first call. One
  * that is NULL, or not aligned as its type must be, is left alone: the output is 0, and ${name}_update returns

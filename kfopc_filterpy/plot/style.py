@@ -26,7 +26,6 @@ STYLES: dict[str, tuple[str, Any, str]] = {
     "re-scaling FxLMS": ("#8C564B", _DASHED, "<"),
     "two-gradient FxLMS": ("#7F7F7F", _DASHED, ">"),
     "clipping FxLMS": ("#B8A000", _DASHED, "h"),
-    "KF-OPC repaired": ("#332288", "-", "p"),
     "diagonal KF": ("#882255", "-", "d"),
     "diagonal KF-OPC": ("#44AA99", "-", "8"),
     "FxNLMS": ("#AA4499", _DASHED, "*"),
@@ -36,7 +35,6 @@ STYLES: dict[str, tuple[str, Any, str]] = {
     "MOV-MFxLMS": ("#88CCEE", _DASHED, "3"),
     "frequency-domain FxLMS": ("#CC6677", "-", "H"),
     "power-limited FxLMS": ("#DDAA33", "-", "H"),
-    "band-limited FxLMS": ("#6699CC", "-", "H"),
 }
 UNLISTED = ("#000000", ":", "x")  # an algorithm that is not in the table
 COLOURS = 6  # curves without an algorithm take the colours and markers of the first so many rows

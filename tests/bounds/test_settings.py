@@ -16,7 +16,6 @@ from kfopc_filterpy import (
     bandpass_path,
     kf_anc,
     kf_opc,
-    kf_opc_repaired,
     kf_pb,
     noise_reduction_db,
     simulate,
@@ -208,8 +207,8 @@ def test_the_shortest_record_and_the_longest_filter_that_it_supports():
 
 @pytest.mark.parametrize(
     "make",
-    [kf_anc, partial(kf_opc, rated_power=1.0), partial(kf_opc_repaired, rated_power=1.0)],
-    ids=["KF-ANC", "KF-OPC", "repaired"],
+    [kf_anc, partial(kf_opc, rated_power=1.0)],
+    ids=["KF-ANC", "KF-OPC"],
 )
 @pytest.mark.parametrize("given", [{}, {"state_noise": 1e-9}, {"measurement_noise": 0.1}], ids=["none", "r", "q"])
 def test_controllers_without_the_noises_point_to_it(make, given):
@@ -263,7 +262,7 @@ def test_a_large_initial_variance_diverges_where_the_suggested_one_does_not():
 # ---- In place of the taps
 
 
-@pytest.mark.parametrize("make", [kf_anc, kf_opc, kf_opc_repaired], ids=lambda make: make.__name__)
+@pytest.mark.parametrize("make", [kf_anc, kf_opc], ids=lambda make: make.__name__)
 def test_a_controller_takes_suggested_settings_where_none_is_given(make: Any) -> None:
     rated = {} if make is kf_anc else {"rated_power": 0.5}
     suggested = suggest_settings(X, D, S, n_taps=8)
@@ -299,7 +298,7 @@ def test_the_sample_rate_is_that_of_the_suggested_settings() -> None:
         kf_pb(suggested, S, rated_power=0.5, fs=16000.0)
 
 
-@pytest.mark.parametrize("make", [kf_anc, kf_opc, kf_opc_repaired, kf_pb], ids=lambda make: make.__name__)
+@pytest.mark.parametrize("make", [kf_anc, kf_opc, kf_pb], ids=lambda make: make.__name__)
 def test_a_limiter_of_another_sample_rate_than_the_suggested_settings_is_refused(make: Any) -> None:
     rated = {} if make is kf_anc else {"rated_power": 0.5}
     suggested = suggest_settings(X, D, S, n_taps=8, fs=8000.0)

@@ -32,7 +32,6 @@ SETTINGS = {
     "MOV-FxLMS": STEP | {"rated_power": 0.5, "penalty_factor": 0.2},
     "MOV-MFxLMS": STEP | {"rated_power": 0.5},
     "clipping FxLMS": STEP | {"amplitude_limit": 0.8},
-    "fast-array KF": {"measurement_noise": 1.0},
 }
 
 

@@ -163,5 +163,5 @@ def test_channels_that_do_not_fit_are_refused(changed, match):
 
 
 def test_an_algorithm_of_one_channel_is_refused_by_name(channels):
-    with pytest.raises(ValueError, match="KF-OPC repaired is not compared with several channels"):
-        make_controller(channels, "KF-OPC repaired", 1e-6)
+    with pytest.raises(ValueError, match="diagonal KF-OPC is not compared with several channels"):
+        make_controller(channels, "diagonal KF-OPC", 1e-6)

@@ -53,8 +53,7 @@ def test_each_is_made_as_the_registry_says(name: str, scene: Scene) -> None:
     np.testing.assert_array_equal(controller.secondary_path, estimate)
     assert controller.weights.shape == (12,)
     rated = 0.5 if REGISTRY[name].sees_budget or name == "MOV-FxLMS fixed" else None
-    octaves = name == "band-limited FxLMS"  # each has a least share
-    assert getattr(controller, "rated_power", None) == (pytest.approx(rated, rel=1e-3) if octaves else rated)
+    assert getattr(controller, "rated_power", None) == rated
     result = run_setting(scene, name, middle(name))
     assert result is not None
     assert result.algorithm == name

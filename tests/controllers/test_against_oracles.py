@@ -17,13 +17,11 @@ from oracles.diagonal import DiagonalKalman as DiagonalOracle
 from oracles.kalman import Kalman
 from oracles.limiter import Limiter
 from oracles.powers import Constraint
-from oracles.repaired import RepairedKFOPC
-from oracles.rls import FiniteMemoryRLS, FxRLS
+from oracles.rls import FxRLS
 
 from kfopc_filterpy import (
     ClippingFxLMS,
     DiagonalKalman,
-    FastArrayKalman,
     FxLMS,
     FxNLMS,
     HardClipAmplifier,
@@ -38,7 +36,6 @@ from kfopc_filterpy import (
     fx_rls,
     kf_anc,
     kf_opc,
-    kf_opc_repaired,
     simulate,
 )
 from kfopc_filterpy.paths import PathTolerance, guard_filter
@@ -134,7 +131,6 @@ LMS: dict[str, Algorithm] = {
 R, Q, P0, LAMBDA = 1e-6, [1e-2, 3e-2, 2e-2], 0.5, 0.9995
 OURS: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
 THEIRS: dict[str, Any] = {"r": R, "q": Q, "P0": P0}
-ARRAY: dict[str, Any] = {"measurement_noise": Q[0], "initial_variance": P0}  # the oracle's P is in units of q
 
 ONE_NOISE: tuple[dict[str, Any], dict[str, Any]] = OURS | {"measurement_noise": Q[0]}, THEIRS | {"q": 3 * Q[:1]}
 
@@ -146,33 +142,9 @@ SEVERAL_KALMAN: dict[str, Algorithm] = {  # several channels, too
 }
 KALMAN: dict[str, Algorithm] = SEVERAL_KALMAN | {
     "FxRLS": (fx_rls, FxRLS, {"forgetting": LAMBDA}, {"forgetting": LAMBDA}),
-    "fast array": (FastArrayKalman, FxRLS, ARRAY, {"P0": P0 / Q[0], "fast_array": True}),
-    "fast array KF-OPC": (FastArrayKalman, FxRLS, ARRAY, {"P0": P0 / Q[0], "fast_array": True}),
-    "fast array, fading": (
-        FastArrayKalman,
-        FxRLS,
-        ARRAY | {"forgetting": LAMBDA},
-        {"P0": P0 / Q[0], "forgetting": LAMBDA, "fast_array": True},
-    ),
-    "fast array, finite": (FastArrayKalman, FiniteMemoryRLS, ARRAY | {"memory": 300}, {"P0": P0 / Q[0], "N": 300}),
-    "repaired": (kf_opc_repaired, RepairedKFOPC, OURS | {"trim_s": 0.05}, THEIRS | {"trim_rate": 1 / (0.05 * FS)}),
-    "repaired measurement": (
-        kf_opc_repaired,
-        RepairedKFOPC,
-        OURS | {"trim_s": 0.05, "factor_at": "measurement"},
-        THEIRS | {"trim_rate": 1 / (0.05 * FS), "factor_at_output": False},
-    ),
-    "repaired gain": (
-        kf_opc_repaired,
-        RepairedKFOPC,
-        OURS | {"trim_s": None, "gain_of": "reference"},
-        THEIRS | {"gain_of_control": False},
-    ),
 }
 ALGORITHMS = LMS | KALMAN
-WITH_POWERS = [
-    name for name in ALGORITHMS if name.startswith(("optimal", "MOV", "repaired")) or name.endswith("KF-OPC")
-]
+WITH_POWERS = [name for name in ALGORITHMS if name.startswith(("optimal", "MOV")) or name.endswith("KF-OPC")]
 
 
 def pair(name: str, scene: Scene, own: Any = None, known: Any = None, window: str = "exponential") -> tuple[Any, Any]:
@@ -209,7 +181,7 @@ def test_every_algorithm(name: str, scene: Scene) -> None:
     compare(scene, *pair(name, scene), 4000 if scene.one else 3000)
 
 
-@cases("FxLMS", "FxNLMS", "leaky", "MOV", "two-gradient", "re-scaling", "KF-OPC", "diagonal KF-OPC", "repaired")
+@cases("FxLMS", "FxNLMS", "leaky", "MOV", "two-gradient", "re-scaling", "KF-OPC", "diagonal KF-OPC")
 def test_with_a_guard(name: str, scene: Scene) -> None:
     W = guard_filter(UNCERTAINTY, scene.s_hat)
     controller, oracle = pair(name, scene, known={"guard": W})
@@ -217,7 +189,7 @@ def test_with_a_guard(name: str, scene: Scene) -> None:
     compare(scene, controller, oracle, 2000)
 
 
-@cases("FxLMS", "MOV", "two-gradient", "re-scaling", "KF-ANC", "KF-OPC", "FxRLS", "repaired", "fast array")
+@cases("FxLMS", "MOV", "two-gradient", "re-scaling", "KF-ANC", "KF-OPC", "FxRLS")
 def test_with_limiters(name: str, scene: Scene) -> None:
     """Limiters that act."""
     limits: list[tuple[float, Any]] = [
@@ -230,7 +202,7 @@ def test_with_limiters(name: str, scene: Scene) -> None:
 
 
 @cases(
-    "FxLMS", "optimal leaky", "MOV", "MOV modified", "KF-OPC", "diagonal KF-OPC", "FxRLS", "repaired", "fast array KF-OPC"
+    "FxLMS", "optimal leaky", "MOV", "MOV modified", "KF-OPC", "diagonal KF-OPC", "FxRLS"
 )  # fmt: skip
 def test_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> None:
     """The true amplifiers clip hard; a controller that estimates the disturbance takes them for soft ones."""
@@ -242,7 +214,7 @@ def test_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> None:
     compare(scene, *both, 2000, amplifier=HardClipAmplifier(0.15), played=signals.hard_clip(0.15))
 
 
-@cases("KF-OPC", "diagonal KF-OPC", "FxRLS", "fast array KF-OPC", "fast array, finite", "repaired", "MOV")
+@cases("KF-OPC", "diagonal KF-OPC", "FxRLS", "MOV")
 def test_control_that_is_switched_on_later(name: str, scene: Scene) -> None:
     compare(scene, *pair(name, scene), 2000, on=400)
 

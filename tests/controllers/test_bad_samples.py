@@ -83,21 +83,6 @@ def test_a_huge_sample_is_overcome(name: str, half: str) -> None:
         assert np.isfinite(controller.weights).all(), value
 
 
-@pytest.mark.parametrize("name", [name for name in ALL if name.startswith("fast-array")])
-def test_a_fast_array_hears_the_reference_of_a_refused_error(name: str) -> None:
-    """It goes on as one that was told to leave the sample out."""
-    refusing, told = ALL[name](), ALL[name]()
-    rooms = Room(refusing), Room(told)
-    bad_sample(refusing, rooms[0], "update", np.nan, 60)
-    rooms[1].run(told, 60)
-    told.process(rooms[1].x[60:61], rooms[1].d[60:61], adapt=False)
-    for x, d in zip(rooms[1].x[61:200], rooms[1].d[61:200], strict=True):
-        for one in (refusing, told):
-            one.control_signal(x)
-            one.update(d)
-    np.testing.assert_array_equal(refusing.weights, told.weights)
-
-
 # Forgetting, and a normalised step, where little is excited.
 
 NOISES: dict[str, Any] = {

@@ -25,7 +25,7 @@ from kfopc_filterpy import (
 )
 
 RATED_POWER, WINDOW = 0.05, 80  # of the limiter; the window in samples
-NAMES = ("KF-ANC", "KF-OPC", "KF-OPC repaired", "KF-PB", "FxLMS", "MOV")
+NAMES = ("KF-ANC", "KF-OPC", "KF-PB", "FxLMS", "MOV")
 
 
 def limiter(rated_power: float = RATED_POWER, **options: Any) -> OutputLimiter:

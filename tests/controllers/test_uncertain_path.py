@@ -9,7 +9,6 @@ import pytest
 
 from kfopc_filterpy import (
     KFOPC,
-    FastArrayKalman,
     KalmanController,
     LeakyFxLMS,
     OutputPowerConstraint,
@@ -55,7 +54,6 @@ def test_a_tone_at_which_the_path_is_reversed_is_left_alone(name: str) -> None:
 def test_what_takes_no_uncertainty_says_what_does() -> None:
     settings: dict[str, Any] = {"state_noise": 0.0, "measurement_noise": 0.1}
     for controller in (
-        FastArrayKalman(4, TRUE, measurement_noise=0.1),
         kf_pb(4, TRUE, rated_power=1.0, secondary_path_uncertainty=TOLERANCE),
         KalmanController(KFOPC(dim_x=4, dim_z=1), TRUE),
     ):

@@ -10,7 +10,6 @@ from helpers.simulation import Integrator
 
 from kfopc_filterpy import (
     DiagonalKalman,
-    FastArrayKalman,
     FxLMS,
     LimitedController,
     MOVFxLMS,
@@ -18,7 +17,6 @@ from kfopc_filterpy import (
     OutputLimiter,
     kf_anc,
     kf_opc,
-    kf_opc_repaired,
     kf_pb,
     simulate,
 )
@@ -33,10 +31,8 @@ X = np.random.default_rng(0).standard_normal(2000)
 
 RATED: dict[str, Any] = {
     "KF-OPC": lambda power: kf_opc(8, PATH, rated_power=power, **KALMAN),
-    "KF-OPC repaired": lambda power: kf_opc_repaired(8, PATH, rated_power=power, **KALMAN),
     "KF-PB": lambda power: kf_pb(8, PATH, rated_power=power, fs=FS),
     "diagonal": lambda power: DiagonalKalman(8, PATH, rated_power=power, **KALMAN),
-    "fast array": lambda power: FastArrayKalman(8, PATH, measurement_noise=1e-3, rated_power=power),
     "MOV": lambda power: MOVFxLMS(8, PATH, step_size=1e-3, rated_power=power),
     "optimal leaky": lambda power: OptimalLeakyFxLMS(8, PATH, step_size=1e-3, rated_power=power),
     "KF-OPC, several": lambda power: kf_opc(8, PATHS, rated_power=power, **KALMAN),

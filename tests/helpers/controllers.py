@@ -15,7 +15,6 @@ from kfopc_filterpy import (
     BandLimitedFxLMS,
     ClippingFxLMS,
     DiagonalKalman,
-    FastArrayKalman,
     FrequencyDomainFxLMS,
     FrequencyDomainKalman,
     FxLMS,
@@ -34,7 +33,6 @@ from kfopc_filterpy import (
     fx_rls,
     kf_anc,
     kf_opc,
-    kf_opc_repaired,
     kf_pb,
 )
 from kfopc_filterpy.controllers import (
@@ -66,14 +64,10 @@ MAKERS: dict[str, Any] = {
     "KF-ANC": lambda **o: kf_anc(N_TAPS, S_HAT, **KALMAN, **o),
     "KF-OPC": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
     "KF-OPC, sliding": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(window="sliding"), **KALMAN, **o),
-    "KF-OPC repaired": lambda **o: kf_opc_repaired(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
     "KF-PB": lambda **o: short_blocks(N_TAPS, S_HAT, rated_power=0.3, **o),
     "fxRLS": lambda **o: fx_rls(N_TAPS, S_HAT, forgetting=0.999, **o),
     "diagonal KF": lambda **o: DiagonalKalman(N_TAPS, S_HAT, **KALMAN, **o),
     "diagonal KF-OPC": lambda **o: DiagonalKalman(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
-    "fast-array KF": lambda **o: FastArrayKalman(N_TAPS, S_HAT, measurement_noise=Q, **o),
-    "fast-array KF-OPC": lambda **o: FastArrayKalman(N_TAPS, S_HAT, measurement_noise=Q, constraint=constraint(), **o),
-    "finite-memory fast array": lambda **o: FastArrayKalman(N_TAPS, S_HAT, measurement_noise=Q, memory=2 * N_TAPS, **o),
     "FxLMS": lambda **o: FxLMS(N_TAPS, S_HAT, step_size=MU, **o),
     "FxNLMS": lambda **o: FxNLMS(N_TAPS, S_HAT, step_size=0.1, **o),
     "leaky": lambda **o: LeakyFxLMS(N_TAPS, S_HAT, step_size=MU, leak=0.3, **o),
@@ -91,7 +85,7 @@ KNOWS_AN_AMPLIFIER = [
 ]
 VARIANTS = [(name, "plain") for name in MAKERS]
 # The limiter acts on what they emit, alike for all; these adapt to it in different ways. Each is compiled anew for it.
-LIMITED = ("KF-ANC", "KF-OPC", "KF-OPC repaired", "KF-PB", "FxLMS", "MOV", "two-gradient", "re-scaling", "clipping")
+LIMITED = ("KF-ANC", "KF-OPC", "KF-PB", "FxLMS", "MOV", "two-gradient", "re-scaling", "clipping")
 VARIANTS += [(name, "limiter") for name in LIMITED]
 VARIANTS += [(name, "known amplifier") for name in KNOWS_AN_AMPLIFIER]
 

@@ -29,10 +29,7 @@ ALGORITHMS: dict[str, Mapping[str, float]] = {
     "clipping": {"step_size": 2.0**-7, "amplitude_limit": 2.0**-4},
     "rescaling": {"step_size": 2.0**-7, "amplitude_limit": 2.0**-4},
     "kalman": KALMAN,
-    "repaired": KALMAN | {"of_control": 1.0, "trim_rate": 2.0**-7, "at_output": 1.0},
     "diagonal": {"state_noise": 2.0**-20, "measurement_noise": 2.0**-7, "initial_variance": 2.0**-7},
-    "fast_array": {"measurement_noise": 2.0**-4, "initial_variance": 2.0**-4, "forgetting": 1.0},
-    "finite_memory": {"measurement_noise": 2.0**-4, "initial_variance": 2.0**-4, "memory": 64.0},
     "power_budget": {
         "rated_power": 2.0**-6,
         "block": 16.0,

@@ -19,7 +19,6 @@ from kfopc_filterpy import (
     fx_rls,
     kf_anc,
     kf_opc,
-    kf_opc_repaired,
     kf_pb,
     simulate,
 )
@@ -125,9 +124,6 @@ def supplied(rated_power):
 
 ALGORITHMS = {
     "FxRLS": lambda _: fx_rls(7, S_HAT, forgetting=0.999),
-    "KF-OPC repaired": lambda power: kf_opc_repaired(
-        7, S_HAT, rated_power=power, state_noise=1e-5, measurement_noise=0.1
-    ),
     "limiter and guard": limited,
     "factor supplied": supplied,
     "FxLMS": lambda _: FxLMS(7, S_HAT, step_size=0.01),
