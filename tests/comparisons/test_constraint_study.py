@@ -217,5 +217,5 @@ def test_measured_data_join_where_they_are_at_hand(shared_data: Any, data_folder
     assert np.sum(pairs["measured duct"][1] ** 2) == pytest.approx(1.0, rel=1e-12)
     motor = [made["motor"](0.5, seed) for seed in (1, 2)]
     assert not np.array_equal(*motor)
-    # 18 cases: 11 settings, 2 durations with 4 seeds each; convergence on 9, clipping of 6
-    assert constraint.planned_runs() == 18 * 11 + 18 * 8 + 9 + 6
+    # 18 cases: 6 settings, 2 durations with 4 seeds each; convergence on 9, clipping of 6
+    assert constraint.planned_runs() == 18 * 6 + 18 * 8 + 9 + 6
