@@ -7,7 +7,6 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -33,16 +32,6 @@ pytest.register_assert_rewrite("helpers")  # their assertions say what they comp
 
 ROOT = Path(__file__).resolve().parents[1]
 collect_ignore = ["signals/fuzz_readers.py"]  # a program, which needs atheris
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip the examples of rooms where pyroomacoustics is not installed; their tests ask for it themselves."""
-    if find_spec("pyroomacoustics") is not None:
-        return
-    missing = pytest.mark.skip(reason="needs pyroomacoustics (the extra `rooms`)")
-    for item in items:
-        if isinstance(item, pytest.DoctestItem) and item.name == "kfopc_filterpy.paths.rooms.room_paths":
-            item.add_marker(missing)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ import json
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -140,8 +139,6 @@ def _duct(fs: float) -> Pair:
 
 
 def _room(fs: float, *, loudspeakers: int) -> Pair:
-    if find_spec("pyroomacoustics") is None:
-        raise LeftOut('needs pyroomacoustics: python -m pip install -c constraints.txt -e ".[rooms]"')
     room = built_in_room(loudspeakers)
     return room.primary, room.secondary
 
@@ -177,7 +174,7 @@ PATHS: dict[str, Callable[..., Pair]] = {
 
 
 def read_task(path: Path) -> Task:
-    """Return the task of a file; raise `LeftOut` if this machine lacks its data or a package."""
+    """Return the task of a file; raise `LeftOut` if this machine lacks its data."""
     return _made(_task, tomllib.loads(path.read_text(encoding="utf-8")), path.name, path=path)
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power
-from kfopc_filterpy._validate import how_to_install
 from kfopc_filterpy.plot import curve_style, plot_nse
 
 from .. import bench
@@ -54,13 +53,8 @@ def planned_runs() -> int:
     return sum(len(settings) for place, _ in cases() for settings in coarse_grids(place).values())
 
 
-def main(runs: Runs) -> StudyReport | str:
+def main(runs: Runs) -> StudyReport:
     """Run the study in the places that are available."""
-    if not places():
-        return (
-            f"multichannel: left out. The built-in room needs pyroomacoustics ({how_to_install('rooms')}), the measured "
-            "room its data (KFOPC_DATA)."
-        )
     rows: list[ChannelRow] = []
     tuned: dict[str, dict[str, Tuned]] = {}
     figures: list[FigureItem] = []
@@ -183,8 +177,6 @@ def _notes(tuned: Mapping[str, Mapping[str, Tuned]]) -> list[str]:
         f"{' and '.join(DIRECT)} run only in systems of up to {MOST_WEIGHTS} weights; in larger ones, the scaled Wiener "
         "solution stands for KF-OPC. For recordings, the bound and the scaled solution have one filter per second.",
     ]
-    if set(places()) <= {MEASURED}:
-        notes.append("pyroomacoustics is not installed: the built-in rooms are left out.")
     if MEASURED not in places():
         notes.append("The measured room was not available (KFOPC_DATA): it is left out.")
     edges = sorted({name for own in tuned.values() for name, best in own.items() if best.at_edge})

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
+import pyroomacoustics as pra
 from scipy.signal import fftconvolve
 
 from kfopc_filterpy import SimulationResult, signals
-from kfopc_filterpy.paths import RoomPaths, horizontal_plane, room_paths
 
 from ..bench import FigureItem, Scene
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of, measured_room, recordings, unit_scene
@@ -21,6 +20,9 @@ from .report_parts import new_figure
 FS = 4000.0  # of the built-in room: ample for a band up to 500 Hz, with a quarter of the samples of 16 kHz
 N_TAPS, N_PATH_TAPS = 128, 256
 SIZE_M, HEIGHT_M, REVERBERATION_S = (6.0, 4.0, 2.6), 1.2, 0.25
+SPEED_OF_SOUND = 343.0  # in m/s
+HALF_WIDTH = 10  # samples on each side of an arrival: the response is then flat within 0.2 dB up to 0.4 fs
+REACH_M = (N_PATH_TAPS + HALF_WIDTH) / FS * SPEED_OF_SOUND  # from which sound arrives within the taps
 SOURCE_M = (0.6, 2.3, 1.4)
 SIZES = (2, 4, 8)
 MEASURED_N_TAPS = 256
@@ -46,30 +48,70 @@ class Place:
     noises: dict[str, Callable[[float], np.ndarray]]  # functions of a duration in s
 
 
-def built_in_room(size: int) -> RoomPaths:
+@dataclass(frozen=True)
+class Room:
+    """Positions (n, 3) in m in the built-in room, and the paths between them, (K, I, n_taps) and (K, J, n_taps)."""
+
+    sources_m: np.ndarray
+    loudspeakers_m: np.ndarray
+    microphones_m: np.ndarray
+    primary: np.ndarray
+    secondary: np.ndarray
+
+
+def built_in_room(size: int) -> Room:
     """Return the built-in room, with `size` loudspeakers and as many microphones.
 
     Between the noise source and the far wall, the loudspeakers stand in a row across the room, and the microphones in
     another row 1.2 m behind it.
     """
-    across = np.linspace(0.6, 3.4, size)
     to_and_fro = 0.15 * (-1.0) ** np.arange(size)
-    return room_paths(
-        SIZE_M,
-        sources_m=[SOURCE_M],
-        loudspeakers_m=np.stack([3.2 + to_and_fro, across, np.full(size, 1.1)], axis=1),
-        microphones_m=np.stack([4.4 - to_and_fro, np.linspace(0.9, 3.1, size), np.full(size, HEIGHT_M)], axis=1),
-        reverberation_time_s=REVERBERATION_S,
-        fs=FS,
-        n_taps=N_PATH_TAPS,
-    )
+    source = np.array([SOURCE_M])
+    loudspeakers = np.stack([3.2 + to_and_fro, np.linspace(0.6, 3.4, size), np.full(size, 1.1)], axis=1)
+    microphones = np.stack([4.4 - to_and_fro, np.linspace(0.9, 3.1, size), np.full(size, HEIGHT_M)], axis=1)
+    paths = (paths_between(emitters, microphones) for emitters in (source, loudspeakers))
+    return Room(source, loudspeakers, microphones, *paths)
+
+
+def paths_between(emitters_m: np.ndarray, microphones_m: np.ndarray) -> np.ndarray:
+    """Return the impulse responses of the built-in room, (microphones, emitters, taps), from its image sources.
+
+    An image at a distance r adds its gain over 4 pi r at the time r/c. pyroomacoustics' own responses are not used: they
+    begin 40 samples before the sound arrives, which for a near loudspeaker is before time zero.
+    """
+    absorption, _ = pra.inverse_sabine(REVERBERATION_S, SIZE_M, c=SPEED_OF_SOUND)
+    # An image of order n along a side L is at least (n - 1) L away. By Cauchy and Schwarz, the orders of one that is
+    # heard sum to no more than this.
+    order = int(3 + REACH_M * np.sqrt(np.sum(np.array(SIZE_M) ** -2)))
+    room = pra.ShoeBox(SIZE_M, fs=FS, materials=pra.Material(absorption), max_order=order)
+    room.set_sound_speed(SPEED_OF_SOUND)
+    room.add_microphone(np.divide(SIZE_M, 2))  # without one there are no images; they are the same for all
+    for place in emitters_m:
+        room.add_source(place)
+    room.image_source_model()
+    images = [(source.images.T.astype(float), source.damping[0].astype(float)) for source in room.sources]
+    return np.array([[_response(place, *own) for own in images] for place in microphones_m])
+
+
+def _response(place: np.ndarray, images_m: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """Return the taps from images to a place, each a sinc under a Hann window, narrower if it began before time zero."""
+    distances = np.linalg.norm(images_m - place, axis=1)
+    heard = distances < REACH_M
+    distances, gains = distances[heard, np.newaxis], gains[heard, np.newaxis]
+    arrivals = distances * (FS / SPEED_OF_SOUND)
+    n = np.floor(arrivals).astype(int) + np.arange(1 - HALF_WIDTH, 1 + HALF_WIDTH)
+    late, width = n - arrivals, np.minimum(HALF_WIDTH, arrivals + 1)
+    window = np.where(np.abs(late) < width, 0.5 + 0.5 * np.cos(np.pi * late / width), 0.0)
+    pulses = gains / (4 * np.pi * distances) * np.sinc(late) * window
+    kept = (n >= 0) & (n < N_PATH_TAPS)
+    return np.bincount(n[kept], weights=pulses[kept], minlength=N_PATH_TAPS)
 
 
 @cache
 def places() -> dict[str, Place]:
-    """Return the built-in rooms if pyroomacoustics is installed, and the measured one if its data are available."""
+    """Return the built-in rooms, and the measured one if its data are available."""
     made: dict[str, Place] = {}
-    for size in SIZES if find_spec("pyroomacoustics") else ():
+    for size in SIZES:
         room, name = built_in_room(size), f"{size} x {size}"
         made[name] = Place(name, FS, N_TAPS, room.primary, room.secondary, _noises(FS, BAND_HZ))
     measured = _measured_place()
@@ -140,13 +182,14 @@ def level_map_db(size: int, reference: np.ndarray, result: SimulationResult | No
     result : SimulationResult or None
         The run whose control signal the loudspeakers play; None for silence.
     """
-    plane, paths = _plane(), _paths_to_plane(size)
+    plane = _plane()
+    primary, secondary = _paths_to_plane(size)
     needed = slice(-int(FS) - N_PATH_TAPS + 1, None)
-    sound = fftconvolve(reference[np.newaxis, :, needed], paths.primary, mode="valid", axes=-1).sum(axis=1)
+    sound = fftconvolve(reference[np.newaxis, :, needed], primary, mode="valid", axes=-1).sum(axis=1)
     without = np.mean(sound**2)
     if result is not None:
         y = result.control_signal[np.newaxis, :, needed]
-        sound = sound - fftconvolve(y, paths.secondary, mode="valid", axes=-1).sum(axis=1)
+        sound = sound - fftconvolve(y, secondary, mode="valid", axes=-1).sum(axis=1)
     level = 10 * np.log10(np.mean(sound**2, axis=1) / without)
     return level.reshape(plane.shape[:2]), (plane[0, :, 0], plane[:, 0, 1])
 
@@ -174,9 +217,13 @@ def map_figure(size: int, noise: str, scene: Scene, results: Mapping[str, Simula
 
 
 def _plane() -> np.ndarray:
-    return horizontal_plane(SIZE_M, HEIGHT_M, spacing_m=MAP_SPACING_M)
+    """Return the points of the level map, (n_y, n_x, 3) in m."""
+    x, y = (np.arange(0.5, side / MAP_SPACING_M) * MAP_SPACING_M for side in SIZE_M[:2])
+    return np.stack([*np.meshgrid(x, y), np.full((y.size, x.size), HEIGHT_M)], axis=-1)
 
 
 @cache
-def _paths_to_plane(size: int) -> RoomPaths:
-    return built_in_room(size).at(_plane())
+def _paths_to_plane(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the paths from the noise source and from the loudspeakers to the points of the level map."""
+    room, points = built_in_room(size), _plane().reshape(-1, 3)
+    return paths_between(room.sources_m, points), paths_between(room.loudspeakers_m, points)

@@ -26,9 +26,6 @@ from .reading import read_path as read_path
 from .realization import PathRealization as PathRealization
 from .realization import realize_paths as realize_paths
 from .resampling import resample_path as resample_path
-from .rooms import RoomPaths as RoomPaths
-from .rooms import horizontal_plane as horizontal_plane
-from .rooms import room_paths as room_paths
 from .uncertainty import PathTolerance as PathTolerance
 from .uncertainty import guard_filter as guard_filter
 from .uncertainty import path_uncertainty as path_uncertainty

@@ -206,8 +206,8 @@ def load_measured_room(
     >>> try:
     ...     room = load_measured_room("no/such/folder")
     ... except DataUnavailableError:
-    ...     print("compute a room with room_paths instead")
-    compute a room with room_paths instead
+    ...     print("the data are not here")
+    the data are not here
     """
     paths = _vectors("room", folder, allow_download, timeout_s)
     each = range(1, 5)

@@ -41,10 +41,11 @@ def test_the_figures_say_what_the_page_says(capsys: pytest.CaptureFixture[str]) 
         assert v.reduction_db(error, 21, 22) > 28.0
     assert np.flatnonzero(np.isnan(v.walking["KF-ANC"]))[0] * 0.5 <= 4.0  # two seconds after the first step
     assert v.walking["KF-PB"].max() < 0.0
-    on_the_way = {name: -errors[4:24].mean() for name, errors in v.walking.items()}
-    assert 5.0 < on_the_way["KF-PB"] < on_the_way["FxLMS"] - 1.0
+    lost = {name: v.walking[name][4:24].mean() - v.standing[name][4:].mean() for name in ("KF-PB", "FxLMS")}
+    assert lost["FxLMS"] < lost["KF-PB"] - 5.0
+    assert v.walking["KF-PB"][-1] < v.standing["KF-PB"][4:].mean() + 4.0
     assert min(-v.standing[name][4:].mean() for name in v.makers if name != "FxLMS") > 20.0
-    assert -v.standing["FxLMS"][4:].mean() < 18.0
+    assert -v.standing["FxLMS"][4:].mean() < 20.0
     v = page.run()
     reduction = {name: v.reduction_db(run.error, 8, 10) for name, run in v.runs.items()}
     assert abs(reduction["without feedback"] - reduction["neutralised"]) < 0.5
