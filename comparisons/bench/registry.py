@@ -15,7 +15,7 @@ from kfopc_filterpy.controllers import Controller, penalty_factor
 from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
 from kfopc_filterpy.controllers.table import CORE, MAKERS
 from kfopc_filterpy.power.amplifiers import Amplifier
-from kfopc_filterpy.verdict.runs import STEP_SIZES
+from kfopc_filterpy.verdict.candidates import DIAGONAL_STATE_NOISES, FORGOTTEN, STEP_SIZES
 
 from .scene import Scene
 
@@ -23,9 +23,6 @@ from .scene import Scene
 # noise makes it recursive least squares that never forgets, which would always be best for stationary noise; the tonal
 # study shows the difference.
 STATE_NOISE_GRID = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
-# The diagonal filter learns as slowly as NLMS, and needs less state noise.
-DIAGONAL_GRID = (1e-12, 1e-11, 1e-10, 1e-9, *STATE_NOISE_GRID)
-FORGETTING_GRID = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
 PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer grid around the best value follows
 BLOCK_STEP_GRID = (0.02, 0.05, 0.1, 0.2, 0.4)  # divided by the power in each bin, so it needs no units
 PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1, 2.0)).tolist())
@@ -199,9 +196,9 @@ _RANDOM_WALK: dict[str, Any] = {
     "first": STATE_NOISE_GRID,
     "knows_amplifier": True,
 }
-_DIAGONAL = _RANDOM_WALK | {"first": DIAGONAL_GRID}
-_STEP: dict[str, Any] = {"symbol": "mu", "kind": "mu L E[x'^2]", "first": STEP_SIZES}
-_LEAST_FORGOTTEN: dict[str, Any] = {"symbol": "1 - lambda", "kind": "1 - lambda", "first": FORGETTING_GRID}
+_DIAGONAL = _RANDOM_WALK | {"first": DIAGONAL_STATE_NOISES}
+_STEP: dict[str, Any] = {"symbol": "mu", "kind": "mu L E[x'^2]", "first": STEP_SIZES[::-1]}
+_LEAST_FORGOTTEN: dict[str, Any] = {"symbol": "1 - lambda", "kind": "1 - lambda", "first": FORGOTTEN}
 _LEAK = _STEP | {"second_kind": "leak over E[x'^2]", "second": PRICE_GRID, "sees_budget": False}
 _PENALTY = _STEP | {"second_kind": "penalty factor over G_s", "second": PRICE_GRID, "sees_budget": False}
 _PEAK = _STEP | {"second_kind": "A^2 over the unconstrained power", "second": PEAK_GRID, "sees_budget": False}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from kfopc_filterpy._writing import prepare_folder, replacing_files, write_whole
 from kfopc_filterpy.plot import save_figure
-from kfopc_filterpy.verdict.items import Table, write_files
+from kfopc_filterpy.verdict.items import Table, aligned, write_files
 
 from .opening import claims_sentence, glance
 from .report_page import page
@@ -113,8 +113,7 @@ def results_table(studies: Sequence[StudyReport]) -> str:
             lines += textwrap.wrap(claim.text, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
             lines += textwrap.wrap(claim.measured, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
         for table in _on_a_screen(study):
-            left = set(range(len(table.headings))) - table.numbers
-            lines += ["", *textwrap.wrap(table.caption, 116), *aligned([table.headings, *table.cells], left)]
+            lines += ["", *textwrap.wrap(table.caption, 116), *table.lines]
         lines.append("")
     return "\n".join([*lines, *textwrap.wrap(claims_sentence(studies), 116)])
 
@@ -125,11 +124,3 @@ def _on_a_screen(study: StudyReport) -> list[Table]:
     if not study.claims:
         return fitting
     return [] if study.algorithms else fitting[:1]
-
-
-def aligned(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
-    """Return lines of cells in columns; the columns `left` are aligned to the left."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    sides = ["<" if i in left else ">" for i in range(len(widths))]
-    line = "  ".join(f"{{:{side}{width}}}" for side, width in zip(sides, widths, strict=True))
-    return [line.format(*row).rstrip() for row in rows]

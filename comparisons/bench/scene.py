@@ -27,7 +27,8 @@ from kfopc_filterpy.loop.inputs import channel_disturbances
 from kfopc_filterpy.paths import path_taps
 from kfopc_filterpy.paths.path_matrix import is_path_matrix, secondary_paths
 from kfopc_filterpy.power.amplifiers import Amplifier
-from kfopc_filterpy.verdict.runs import filtered_power, one_blas_thread
+from kfopc_filterpy.verdict.candidates import filtered_power
+from kfopc_filterpy.verdict.runs import one_blas_thread
 
 SENSOR_NOISE_SEED = 1000  # added to the noise's seed
 CHANNEL_RIDGE = 1e-6  # over the filtered power: directions with less energy need weights that no controller reaches

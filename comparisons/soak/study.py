@@ -28,8 +28,7 @@ from scipy.signal import butter, lfilter, sosfilt, unit_impulse
 import kfopc_filterpy as anc
 from kfopc_filterpy import OutputLimiter, simulate
 from kfopc_filterpy._writing import write_whole
-
-from ..bench.report import aligned
+from kfopc_filterpy.verdict.items import aligned
 
 SAMPLES = 10_000_000
 CHECKS = 20  # in a run

@@ -15,7 +15,7 @@ NOT_ENOUGH = 1
 EXAMPLES = """examples:
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --volts-per-unit 10 --want-db 6 -o out
   kfopc verdict noise.wav --disturbance error.wav --secondary S.wav --watt 20 --ohm 8 --rating noise --json
-  kfopc verdict noise.wav --primary P.wav --secondary S.wav --fs 16000 --rated-power 1.6 --taps 256
+  kfopc verdict noise.wav --primary P.wav --secondary S.wav --fs 16000 --rated-power 1.6 --taps 256 --all
   kfopc verdict stereo.wav:0 --disturbance stereo.wav:1 --secondary paths.mat:S --rated-power 1.6
   kfopc verdict ear.wav --feedback --secondary S.wav --watt 0.1 --ohm 32 --volts-per-unit 1.8
   kfopc verdict outside.wav --disturbance ear.wav --feedback --secondary S.wav --watt 0.1 --ohm 32 --volts-per-unit 1.8
@@ -43,8 +43,12 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     )
     parser.add_argument("--feedback", action="store_true", help=about)
     add_number(parser, "--want-db", "dB", as_nonnegative, default=6.0, help="noise reduction wanted (default: 6)")
-    about = "algorithm of the verdict, behind a limiter: KF-PB (default), KF-OPC or FxLMS; the others run beside it"
+    about = "algorithm of the verdict, behind a limiter (default: KF-PB); KF-PB, KF-OPC and FxLMS run beside it"
     parser.add_argument("--algorithm", default="KF-PB", help=about)
+    about = (
+        "compare: run every algorithm beside it, each with the best of the settings that are tried, and print a table"
+    )
+    parser.add_argument("--all", action="store_true", help=about)
     add_count(parser, "--taps", help="taps of the control filter (default: chosen for the recordings, at most 256)")
     about = "memory of KF-OPC; a filter length that is chosen suits it too (default: 0.25 s, with several channels 1 s)"
     add_number(parser, "--memory", "s", help=about)
@@ -69,12 +73,14 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
 def verdict(options: argparse.Namespace) -> int:
     """Print a verdict, and write its page if a folder is given."""
     from ..verdict import assess
+    from ..verdict.assessing import ALL
     from ..verdict.assessment import advice_on
-    from ..verdict.runs import ALGORITHMS
+    from ..verdict.candidates import CANDIDATES
+    from ..verdict.verdict_page import algorithms_table
 
     if options.output is not None:
         prepare_output(options)
-    as_choice(options.algorithm, "--algorithm", ALGORITHMS)
+    as_choice(options.algorithm, "--algorithm", CANDIDATES)
     files = Files(options)
     noise, primary, secondary, disturbance = scene_of(options, files)
     n_microphones, n_loudspeakers, _ = secondary.shape
@@ -88,6 +94,7 @@ def verdict(options: argparse.Namespace) -> int:
             disturbance=disturbance,
             want_db=options.want_db,
             algorithm=options.algorithm,
+            beside=ALL if options.all else None,
             n_taps=options.taps,
             memory_s=options.memory,
             secondary_path_uncertainty=uncertainty_of(options, files, secondary),
@@ -98,7 +105,10 @@ def verdict(options: argparse.Namespace) -> int:
         advice = advice_on(found, fs="--fs ", n_taps="--taps ")
         origin = {"Command": options.command, "Files": "; ".join(files.read)}
         found = replace(found, advice=tuple(advice), notes=(*found.notes, *files.remarks), origin=origin)
-    tell(options, found.json if options.json else str(found), found.notes)
+    text = str(found)
+    if options.all:
+        text = "\n".join([text, "", *algorithms_table(found).lines])
+    tell(options, found.json if options.json else text, found.notes)
     if options.output is not None:
         say_written(options, found.write(options.output), "verdict.json")
     return DONE if found.enough else NOT_ENOUGH

@@ -47,11 +47,14 @@ from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_
 
 from .._types import PathModels, ProgressBar
 from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on
+from .candidates import CANDIDATES, DIRECT, ONE_CHANNEL
 from .fixed_filters import FixedFilters, longest_filter
 from .limits import Limits, Ratings, excursion_mm, limits_of, ratings_of_each, scale_of, watt_per_power, with_excursion
-from .runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce, one_blas_thread
+from .runs import NSE_WINDOW_S, Plan, announce, one_blas_thread
 
-MOST_DIRECT_WEIGHTS = 256  # from which KF-OPC runs beside KF-PB only if asked: a sample takes K (J I L)^2 operations
+ALL = "all"
+USUAL = ("KF-PB", "KF-OPC", "FxLMS")
+MOST_DIRECT_WEIGHTS = 256  # from which the Kalman filters of all weights together run only if they are named
 MEMORY_S, CHANNEL_MEMORY_S = 0.25, 1.0
 WEAK_DB = -20.0  # gain of the secondary path, over its mean in the noise's band, below which the loudspeaker is weak
 LEAST_RUN_S = 2.0  # its second half then has ten of an amplifier's windows of 0.1 s
@@ -109,11 +112,13 @@ def assess(
         so that the coherence can be checked. By default it is computed by the primary path.
     want_db : float, default 6
         Noise reduction wanted in dB.
-    algorithm : {"KF-PB", "KF-OPC", "FxLMS"}, default "KF-PB"
+    algorithm : str, default "KF-PB"
         Controller that the verdict is on. It has a limiter, which keeps the rating in every window.
-    beside : sequence of str, optional
-        Algorithms to run beside it, without a limiter, as published; by default the other two, but KF-OPC only if all
-        control filters together have at most 256 taps, because its cost grows with the square of them.
+    beside : sequence of str or "all", optional
+        Algorithms to run beside it, without a limiter, as published; by default KF-PB, KF-OPC and FxLMS. Each runs with
+        the best of the settings that are tried on the first 5 s: step sizes, state noises or forgetting factors. With
+        several channels KF-OPC and KF-ANC run only if they are named, or if all control filters together have at most
+        256 taps, because their cost grows with the square of them.
     n_taps : int, optional
         Taps of a control filter; by default `suggest_settings` finds them, at most 256, and at most 1024 in all filters
         together.
@@ -132,7 +137,7 @@ def assess(
         neither `primary` nor `disturbance` is given, there is no reference microphone, as in headphones, and `noise` is
         the disturbance.
     bar : tqdm bar, optional
-        Bar that advances with the samples that are run, those on which FxLMS is tuned included; its total is set, and it
+        Bar that advances with the samples that are run, those on which settings are tried included; its total is set, and it
         is described by what is going on.
 
     Returns
@@ -189,8 +194,11 @@ def assess(
     several = s.ndim == 3
     K, J, n_references = (*s.shape[:2], len(x)) if several else (1, 1, 1)
     want_db = as_nonnegative(want_db, "want_db", unit="dB")
-    as_choice(algorithm, "algorithm", ALGORITHMS)
-    others = ALGORITHMS if beside is None else [as_choice(name, "beside", ALGORITHMS) for name in beside]
+    as_choice(algorithm, "algorithm", CANDIDATES)
+    by_name = beside is not None and beside != ALL
+    others = list(CANDIDATES if beside == ALL else USUAL if beside is None else beside)
+    for name in others:
+        as_choice(name, "beside", CANDIDATES)
     ratings = ratings_of_each(rating, J)
     limits = limits_of(ratings, several)
     pascals = None if pascal_per_unit is None else _pascals(pascal_per_unit, K)
@@ -223,12 +231,15 @@ def assess(
     if any(issubclass(warning.category, np.exceptions.RankWarning) for warning in caught):
         notes.append("The reference is so narrow-band that larger weights could do better than the bound.")
     weights = J * n_references * settings.n_taps
-    if several and beside is None and weights > MOST_DIRECT_WEIGHTS and algorithm != "KF-OPC":
-        others = [name for name in others if name != "KF-OPC"]
-        notes.append(
-            f"KF-OPC is left out, because {weights} weights take it long: choose it as the algorithm, or at most "
-            f"{MOST_DIRECT_WEIGHTS // (J * n_references)} taps."
-        )
+    if several and not by_name:
+        others = [name for name in others if name not in ONE_CHANNEL]
+        slow = [name for name in others if name in DIRECT and name != algorithm]
+        if slow and weights > MOST_DIRECT_WEIGHTS:
+            others = [name for name in others if name not in slow]
+            notes.append(
+                f"{' and '.join(slow)} left out, because {weights} weights take long: choose one as the algorithm, or at "
+                f"most {MOST_DIRECT_WEIGHTS // (J * n_references)} taps."
+            )
     names = [algorithm, *(name for name in others if name != algorithm)]
 
     plan = Plan(x, d, s, fs, start, limits, settings, secondary_path_uncertainty, bar, feedback)
@@ -475,19 +486,23 @@ def _least_share(plan: Plan, name: str, want_db: float, start: float, unit: floa
 
 
 def _on_better_runs(figures: Mapping[str, Mapping[str, Any]], algorithm: str) -> list[str]:
-    """Return why the verdict is not on an algorithm that reduced the noise more, or that it should be."""
-    notes = []
-    for name, own in figures.items():
-        if own["noise_reduction_db"] > figures[algorithm]["noise_reduction_db"] + SAME_DB:
-            better = f"{name}, as published, reaches {own['noise_reduction_db']:.1f} dB"
-            mean, worst = (float(np.max(own[key])) for key in ("of_rated_power", "worst_window"))
-            notes.append(
-                f"{better} within the rating: choose it as the algorithm."
-                if worst <= KEPT
-                else f"{better}, but does not keep the rating: its mean power is {mean:.2g} times the rated power, and "
-                f"{worst:.2g} times in its worst window."
-            )
-    return notes
+    """Return why the verdict is not on the best algorithm of those that keep the rating, and of those that do not."""
+    least = figures[algorithm]["noise_reduction_db"] + SAME_DB
+    better = sorted(
+        ((own["noise_reduction_db"], name) for name, own in figures.items() if own["noise_reduction_db"] > least),
+        reverse=True,
+    )
+    notes: dict[bool, str] = {}
+    for reached, name in better:
+        mean, worst = (float(np.max(figures[name][key])) for key in ("of_rated_power", "worst_window"))
+        why = (
+            " within the rating: choose it as the algorithm."
+            if worst <= KEPT
+            else f", but does not keep the rating: its mean power is {mean:.2g} times the rated power, and {worst:.2g} times "
+            "in its worst window."
+        )
+        notes.setdefault(worst <= KEPT, f"{name}, as published, reaches {reached:.1f} dB{why}")
+    return list(notes.values())
 
 
 def _on_louder_bands(run: SimulationResult) -> list[str]:

@@ -72,6 +72,11 @@ class Table:
         """Columns with a number in them."""
         return {i for row in self.rows for i, cell in enumerate(row) if not isinstance(cell, str)}
 
+    @property
+    def lines(self) -> list[str]:
+        """The table for a terminal, without its caption."""
+        return aligned([self.headings, *self.cells], set(range(len(self.headings))) - self.numbers)
+
 
 @dataclass(frozen=True)
 class FigureItem:
@@ -155,6 +160,14 @@ class Sound:
         """Return the part of a signal, of `fs` samples per second, that the page plays: 4 s, or what there is of them."""
         first = round(self.from_s * fs)
         return signal[first : first + round(EXCERPT_S * fs)]
+
+
+def aligned(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
+    """Return lines of cells in columns; the columns `left` are aligned to the left."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    sides = ["<" if i in left else ">" for i in range(len(widths))]
+    line = "  ".join(f"{{:{side}{width}}}" for side, width in zip(sides, widths, strict=True))
+    return [line.format(*row).rstrip() for row in rows]
 
 
 def file_of(folder: Path, name: str, item: FigureItem | Sound | Table) -> Path:

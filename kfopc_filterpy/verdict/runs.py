@@ -8,29 +8,32 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.signal import fftconvolve
 from threadpoolctl import threadpool_limits
 
-from kfopc_filterpy import FxLMS, OutputPowerConstraint, SimulationResult, kf_opc, kf_pb, nse_db, simulate
+from kfopc_filterpy import SimulationResult, nse_db, simulate
 from kfopc_filterpy.bounds import SuggestedSettings
 from kfopc_filterpy.controllers import with_internal_model
+from kfopc_filterpy.controllers.table import CORE
 
 from .._types import ProgressBar
-from .limits import ChannelLimits, Limits, amplifiers, each_of, scaled
+from .candidates import CANDIDATES, Known, Settings, filtered_power
+from .limits import ChannelLimits, Limits, amplifiers, scaled
 
-ALGORITHMS = ("KF-PB", "KF-OPC", "FxLMS")
 NSE_WINDOW_S = 0.1  # of the figures that are drawn beside the time of convergence
-TUNED_ON_S = 5.0  # of the record, for FxLMS's step size
-# Step sizes that are tried, over the taps and the power of the filtered reference. From twice the largest on, gradient
-# descent diverges on any noise; with the smallest it learns for some 10^4 samples per tap.
-STEP_SIZES = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
+TUNED_ON_S = 5.0  # of the record, if there are several settings to try
 
 
 class AllDivergedError(RuntimeError):
     """No setting that was tried is stable."""
+
+
+def refused_in_a_run(error: ValueError) -> bool:
+    """Return whether a controller refused to go on in a run, as FxRLS may, not to be made."""
+    return any(note.startswith("in sample") for note in getattr(error, "__notes__", ()))
 
 
 @contextmanager
@@ -41,16 +44,6 @@ def one_blas_thread() -> Iterator[None]:
     """
     with threadpool_limits(1, user_api="blas"):
         yield
-
-
-def filtered_power(x: np.ndarray, s: np.ndarray) -> float:
-    """Return the power of the filtered reference; it makes step sizes and state noises comparable.
-
-    With several channels, it is summed over microphones and references, and averaged over loudspeakers.
-    """
-    x, s = np.atleast_2d(x), s if s.ndim == 3 else s.reshape(1, 1, -1)
-    filtered = fftconvolve(x[np.newaxis, np.newaxis], s[:, :, np.newaxis], axes=-1)[..., : x.shape[1]]
-    return float(np.mean(filtered**2, axis=(1, 3)).sum())
 
 
 @dataclass
@@ -84,8 +77,8 @@ class Plan:
 
     def planned_samples(self, name: str) -> int:
         """Return how many samples an algorithm runs over, its tuning included."""
-        tuned_on = len(STEP_SIZES) * self.tuning_samples if name == "FxLMS" else 0
-        return tuned_on + self.x.shape[-1] - self.start
+        tried = len(self.candidates(name, self.limits))
+        return (tried * self.tuning_samples if tried > 1 else 0) + self.x.shape[-1] - self.start
 
     def advance(self, samples: int) -> None:
         """Move the bar, if there is one; several threads share it."""
@@ -94,85 +87,93 @@ class Plan:
                 self.bar.update(samples)
 
     def run(self, name: str, *, limited: bool, share: float = 1.0) -> SimulationResult:
-        """Run an algorithm, behind a limiter or not, with a share of the rating's power."""
+        """Run an algorithm with its best setting, behind a limiter or not, with a share of the rating's power."""
         limits = scaled(self.limits, share)
-        controller = self.controller(name, limits, limited)
+        limiter = limits.limiter(self.fs) if limited else None
+        controller = self.controller(name, self.best(name, limits), limiter=limiter)
         heard: Any = self.x
         if self.feedback:
             controller = with_internal_model(controller)
             heard = np.atleast_2d(self.x)[: controller.n_references] if controller.n_references else None
+        first_and_last = self.x.shape[-1] - self.start - 1 if self.feedback else None
+        try:
+            return self.simulated(
+                controller, heard, self.d, limits, record_weights_every=first_and_last, progress=self.advance
+            )
+        except ValueError as error:
+            if not refused_in_a_run(error):
+                raise
+            raise AllDivergedError(f"{name} could not go on: {error}") from error
+
+    def simulated(self, controller: Any, x: Any, d: np.ndarray, limits: Limits, **options: Any) -> SimulationResult:
+        """Return the run of a controller on references and disturbances."""
         return simulate(
             controller,
-            heard,
-            disturbance=self.d,
+            x,
+            disturbance=d,
             secondary_path=self.s,
             fs=self.fs,
             amplifier=amplifiers(limits),
             rated_power=limits.rated_power,
             switch_on_s=self.start / self.fs,
-            record_weights_every=self.x.shape[-1] - self.start - 1 if self.feedback else None,  # the first and the last
-            progress=self.advance,
+            **options,
         )
 
-    def controller(self, name: str, limits: Limits, limited: bool) -> Any:
+    def controller(self, name: str, settings: Settings, **options: Any) -> Any:
         """Return a fresh controller."""
-        limiter = limits.limiter(self.fs) if limited else None
-        n_taps = self.settings.n_taps
-        several = isinstance(limits, ChannelLimits)
-        outside: dict[str, Any] = {"limiter": limiter}
-        if several:
-            outside["n_references"] = len(self.x)
-        noises: dict[str, Any] = self.settings.settings
-        if name == "FxLMS":
-            return FxLMS(n_taps, self.s, step_size=self.step_size(limits), **outside)
-        if name == "KF-OPC":
-            each = [OutputPowerConstraint(one.rated_power, fs=self.fs) for one in each_of(limits)]
-            return kf_opc(n_taps, self.s, constraint=each if several else each[0], **outside, **noises)
-        return kf_pb(
-            n_taps,
-            self.s,
-            rated_power=limits.rated_power,
-            fs=self.fs,
-            secondary_path_uncertainty=self.uncertainty,
-            **outside,
-        )
+        if isinstance(self.limits, ChannelLimits):
+            options["n_references"] = len(self.x)
+        return CORE[name](self.settings.n_taps, self.s, **settings, **options)
 
     @property
     def tuning_samples(self) -> int:
-        """Samples of the record's start on which each step size is tried."""
+        """Samples of the record's start on which each setting is tried, from the switch-on."""
         return min(round(TUNED_ON_S * self.fs), self.x.shape[-1] - self.start)
 
-    def step_size(self, limits: Limits) -> float:
-        """Return the step size of FxLMS with the lowest mean NSE over the start of the record, among the stable ones.
+    @cached_property
+    def excerpt(self) -> tuple[np.ndarray, np.ndarray]:
+        """References and disturbances on which settings are tried."""
+        end = self.start + self.tuning_samples
+        return self.x[..., :end], self.d[..., :end]
 
-        Errors that agree to 0.01 dB are a tie, which goes to the smaller step.
+    @cached_property
+    def powers(self) -> tuple[float, float]:
+        """Power of the reference and of the filtered reference, in the excerpt."""
+        x = np.atleast_2d(self.excerpt[0])
+        return float(np.mean(x**2, axis=-1).sum()), filtered_power(x, self.s)
+
+    def candidates(self, name: str, limits: Limits) -> list[Settings]:
+        """Return the settings to try for an algorithm."""
+        return CANDIDATES[name](Known(self.fs, limits, self.settings, self.uncertainty, *self.powers))
+
+    def best(self, name: str, limits: Limits) -> Settings:
+        """Return the setting with the lowest mean NSE over the start of the record, among those that do not diverge.
+
+        Errors that agree to 0.01 dB are a tie, which goes to the smaller setting.
         """
-        x, d = (one[..., : self.start + self.tuning_samples] for one in (self.x, self.d))
-        unit = self.settings.n_taps * filtered_power(x, self.s)
-        several: dict[str, Any] = {"n_references": len(x)} if isinstance(limits, ChannelLimits) else {}
+        tried, (x, d) = self.candidates(name, limits), self.excerpt
+        if len(tried) == 1:
+            return tried[0]
 
-        def error_db(step: float) -> float:
-            run = simulate(
-                FxLMS(self.settings.n_taps, self.s, step_size=step / unit, **several),
-                x,
-                disturbance=d,
-                secondary_path=self.s,
-                fs=self.fs,
-                amplifier=amplifiers(limits),
-                rated_power=limits.rated_power,
-                switch_on_s=self.start / self.fs,
-            )
-            self.advance(self.tuning_samples)
+        def error_db(settings: Settings) -> float:
+            try:
+                run = self.simulated(self.controller(name, settings), x, d, limits)
+            except ValueError as error:
+                if not refused_in_a_run(error):
+                    raise
+                return np.inf
+            finally:
+                self.advance(self.tuning_samples)  # at once, because a run that diverges ends early
             if run.diverged_at_s is not None:
                 return np.inf
             # There is no NSE until the first sound has passed the primary path.
             return round(float(np.nanmean(nse_db(run.error, run.disturbance, self.fs, NSE_WINDOW_S))), 2)
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            least, best = min(zip(pool.map(error_db, STEP_SIZES), STEP_SIZES, strict=True))
-        if least == np.inf:
-            raise AllDivergedError(f"FxLMS diverged with every step size tried: {[step / unit for step in STEP_SIZES]}")
-        return best / unit
+            errors = list(pool.map(error_db, tried))
+        if min(errors) == np.inf:
+            raise AllDivergedError(f"{name} diverged with every setting tried: {tried}")
+        return tried[int(np.argmin(errors))]
 
 
 def announce(bar: ProgressBar | None, samples: int, description: str) -> None:

@@ -202,7 +202,7 @@ def run_sounds(runs: Mapping[str, SimulationResult], own: str = "") -> Iterator[
 
 def _tables(verdict: Assessment) -> Any:
     """Yield the tables: what limits, the algorithms, the bands."""
-    taps, volts = verdict.settings.n_taps, verdict.volts_per_unit
+    taps = verdict.settings.n_taps
     rows: list[list[str | float]] = []
     for name, what, cause in CHAIN:
         value = getattr(verdict.ceilings, name)
@@ -212,18 +212,7 @@ def _tables(verdict: Assessment) -> Any:
     rows.append([f"The run of {verdict.algorithm}", f"{verdict.noise_reduction_db:.1f} dB", adapting])
     rows.append(["Wanted", f"{verdict.want_db:.1f} dB", ""])
     yield Table("ceilings", "What limits", ["Ceiling", "Noise reduction", ""], rows)
-    columns = [
-        ("Noise reduction (dB)", "noise_reduction_db", None),
-        (_power_label(verdict), "output_power", verdict.watt_per_power),
-        ("Power / rated power", "of_rated_power", None),
-        ("Worst window", "worst_window", None),
-        ("Highest peak" if volts is None else "Highest peak (V)", "peak_control_signal", volts),
-    ]
-    rows = []
-    for name, own in verdict.figures.items():
-        label = name if name == verdict.algorithm else f"{name}, as published"
-        rows.append([label, *(_number(own[key], scale) for _, key, scale in columns)])
-    yield Table("algorithms", "The controllers", ["Controller", *(heading for heading, *_ in columns)], rows)
+    yield algorithms_table(verdict)
     if verdict.channels is not None:
         yield Table(
             "microphones",
@@ -244,6 +233,23 @@ def _tables(verdict: Assessment) -> Any:
         ]
         left_out = 1 if verdict.channels is None else 0  # one microphone needs no number
         yield Table("levels", "Third-octave bands", headings[left_out:], [row[left_out:] for row in rows])
+
+
+def algorithms_table(verdict: Assessment) -> Table:
+    """Return the figures of merit of each run."""
+    volts = verdict.volts_per_unit
+    columns = [
+        ("Noise reduction (dB)", "noise_reduction_db", None),
+        (_power_label(verdict), "output_power", verdict.watt_per_power),
+        ("Power / rated power", "of_rated_power", None),
+        ("Worst window", "worst_window", None),
+        ("Highest peak" if volts is None else "Highest peak (V)", "peak_control_signal", volts),
+    ]
+    rows: list[list[str | float]] = []
+    for name, own in verdict.figures.items():
+        label = name if name == verdict.algorithm else f"{name}, as published"
+        rows.append([label, *(_number(own[key], scale) for _, key, scale in columns)])
+    return Table("algorithms", "The controllers", ["Controller", *(heading for heading, *_ in columns)], rows)
 
 
 def _number(value: Any, scale: Any = None) -> Any:

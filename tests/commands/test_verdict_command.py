@@ -25,6 +25,7 @@ from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.signals import band_limited_noise, read_recording, write_wav
 from kfopc_filterpy.verdict import assess
 from kfopc_filterpy.verdict.assessment import SCHEMA
+from kfopc_filterpy.verdict.candidates import CANDIDATES
 
 
 def test_a_process_ends_with_0_if_the_amplifier_is_enough_and_writes_what_it_says(folder, tmp_path):
@@ -81,6 +82,14 @@ def test_a_verdict_names_options_in_its_advice_and_on_its_page(command, tmp_path
     assert "8 taps last 1 ms, but the noise arrives up to 1.9 ms later than the loudspeaker's sound" in told
     assert "take a longer filter with --taps 32." in told
     assert "--taps 32" in (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")
+
+
+def test_all_algorithms_are_printed_as_a_table(command, folder):
+    code, out, _ = command("verdict", *SCENE, "--rated-power", "4", "--taps", "8", "--all")
+    verdict, table = out.split("\n\n")
+    assert verdict.startswith("Enough" if code == 0 else "Not enough")
+    names = [line.split(", as published")[0].split("  ")[0] for line in table.splitlines()]
+    assert names == ["Controller", *CANDIDATES]
 
 
 def test_a_verdict_notes_a_short_or_clipped_recording_in_terminal_and_json(command, folder):

@@ -19,7 +19,7 @@ from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
 from kfopc_filterpy.signals import Recording, band_limited_noise
 from kfopc_filterpy.verdict import assess
 from kfopc_filterpy.verdict.assessment import CAUSES, SCHEMA, advice_on
-from kfopc_filterpy.verdict.runs import STEP_SIZES
+from kfopc_filterpy.verdict.candidates import STEP_SIZES
 
 FS, SECONDS, TAPS = 8000, 3.0, 32
 PLENTY = 100.0  # times what full control takes

@@ -190,7 +190,7 @@ def test_every_rating_is_kept_in_every_window_and_the_figures_are_those_of_the_r
 def test_kf_opc_is_left_out_of_large_systems_unless_it_is_asked_for():
     large = on(n_taps=160, beside=None)
     assert "KF-OPC" not in large.runs
-    assert any("KF-OPC is left out, because 320 weights" in note for note in large.notes)
+    assert any("KF-OPC left out, because 320 weights" in note for note in large.notes)
     assert "KF-OPC" in on(n_taps=130, beside=("KF-OPC",), want_db=0.0).runs
 
 
