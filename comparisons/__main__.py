@@ -28,6 +28,7 @@ ALONE = {  # with options of their own
     "soak": ".soak.study",
     "board": ".board.study",
     "benchmark": ".benchmark.study",
+    "data": ".bench.measured",
 }
 STUDIES = {name: _study(name) for name in ("tonal", "broadband", "duct")}
 STUDIES["duct-measured"] = _study("duct", "main_measured")
@@ -51,8 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="STUDY",
         help=f"{', '.join(STUDIES)}, by default all of these; beyond the paper: {', '.join(FURTHER)}; "
         "speed, which times the filter beside others; board, which runs exported controllers on an emulated microcontroller; "
-        "sweep, which runs a grid; soak, which runs controllers for very long; or benchmark, which scores them and others "
-        "on the same tasks; these have options of their own (sweep --help)",
+        "sweep, which runs a grid; soak, which runs controllers for very long; benchmark, which scores them and others "
+        "on the same tasks; or data, which fetches the measured data; these have options of their own (sweep --help)",
     )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

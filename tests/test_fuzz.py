@@ -214,7 +214,7 @@ def test_a_filter_refuses_and_stays_or_is_finite() -> None:
 
 
 WORDS = [
-    *("verdict", "paths", "identify", "inspect", "convert", "resample", "run", "data", "list", "where"),
+    *("verdict", "paths", "identify", "inspect", "convert", "resample", "run"),
     *(
         "noise.wav",
         "P.wav",
@@ -240,7 +240,6 @@ COMMANDS = [
     ["paths", "convert", "S.wav", "S2.csv", "--channel", "0"],
     ["paths", "resample", "S.wav", "S3.wav", "--fs", "4000"],
     ["paths", "identify", "noise.wav", "d.wav", "--taps", "16", "-o", "S4.wav"],
-    ["data", "list", "--json"],
     ["verdict", *SCENE, "--ohm", "8", "--want-db", "nan"],
     ["run", *SCENE, "--seconds", "nan"],
 ]

@@ -122,7 +122,7 @@ def _recording(duration_s: float, *, fs: float, seconds_apart: float, rng: int) 
 def _measured() -> Any:
     measured = measured_data()
     if measured is None:
-        raise LeftOut("needs the measured data: set KFOPC_DATA, or fetch them with kfopc data fetch")
+        raise LeftOut("needs the measured data: set KFOPC_DATA, or fetch them with python -m comparisons data")
     return measured
 
 

@@ -15,9 +15,9 @@ from kfopc_filterpy._types import ChangingPaths
 from kfopc_filterpy.bounds import PowerConstrainedWiener
 from kfopc_filterpy.loop.inputs import disturbance_at_microphone, noise_gain
 from kfopc_filterpy.paths import duct_paths, path_taps
-from kfopc_filterpy.signals import MeasuredDuct, MeasuredRoom
 
 from ..bench import Runs, Scene, Tuned, algorithms, make_controller, make_scene, run_settings
+from ..bench.measured import DataUnavailableError, MeasuredDuct, MeasuredRoom, load_measured_duct, load_measured_room
 from ..bench.scene import louder, reachable_weights
 from ..bench.tuning import best_setting, try_settings
 
@@ -125,8 +125,8 @@ def noises() -> dict[str, Noise]:
 @cache
 def measured_data(noise: str = "motor") -> MeasuredDuct | None:
     """Return the measured duct and one of its recordings, or None if they are not available."""
-    with suppress(signals.DataUnavailableError):
-        return signals.load_measured_duct(noise=noise, allow_download=True)
+    with suppress(DataUnavailableError):
+        return load_measured_duct(noise)
     return None
 
 
@@ -138,8 +138,8 @@ def recordings(*names: str) -> dict[str, np.ndarray]:
 
 def measured_room() -> MeasuredRoom | None:
     """Return the measured room, or None if it is not available."""
-    with suppress(signals.DataUnavailableError):
-        return signals.load_measured_room(allow_download=True)
+    with suppress(DataUnavailableError):
+        return load_measured_room()
     return None
 
 

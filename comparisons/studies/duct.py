@@ -14,10 +14,11 @@ from kfopc_filterpy.bounds import power_constrained_solution, wiener_solution
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import duct_paths, fir_path, secondary_path_gain
 from kfopc_filterpy.plot import plot_constraint_factor, plot_error_spectra, plot_nse, plot_output_power
-from kfopc_filterpy.signals import DataUnavailableError, compressor_noise, load_measured_duct
+from kfopc_filterpy.signals import compressor_noise
 
 from .. import bench
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table
+from ..bench.measured import DataUnavailableError, load_measured_duct
 from . import report_parts as parts
 from .cases import FS, PAPER, SEED, grid_runs, of_unit_gain, run_each
 from .duct_start import Start, faster_claim, start_under_constraint
@@ -77,7 +78,7 @@ def main_motor(runs: Runs) -> StudyReport | str:
 
 def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | str:
     try:
-        data = load_measured_duct(noise=noise, allow_download=True)
+        data = load_measured_duct(noise)
     except DataUnavailableError as error:
         return (
             f"{name} is left out: set KFOPC_DATA to a folder with the measured data, or run again with a network "

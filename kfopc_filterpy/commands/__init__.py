@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from .. import __version__
-from . import data, demo, export, paths, run, verdict
+from . import demo, export, paths, run, verdict
 from .options import WRONG_INPUT, Parser
 
 PIPE_CLOSED = 141  # as of a program that SIGPIPE ends
@@ -19,7 +19,6 @@ EXAMPLES = """examples:
   kfopc paths identify sent.wav received.wav --taps 512 -o S.wav
   kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --seconds 20
   kfopc export controller.toml -o firmware --dtype float32
-  kfopc data list
   kfopc demo FOLDER
 each command has its own --help
 exit codes: 0 done, or the verdict is "enough"; 1 the verdict is "not enough", or a fault stopped a run; 2 wrong input,
@@ -67,6 +66,6 @@ def whole_parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"kfopc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in (verdict, paths, run, export, data, demo):
+    for module in (verdict, paths, run, export, demo):
         module.add_to(commands)
     return parser

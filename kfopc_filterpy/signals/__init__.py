@@ -1,4 +1,4 @@
-"""Noises, recordings, measured data."""
+"""Noises and recordings."""
 
 import lazy_loader
 

@@ -131,11 +131,11 @@ def test_help_loads_nothing_that_takes_long():
     assert shown.stdout.endswith(b"False\n"), shown.stderr
 
 
-def test_a_reader_that_goes_away_ends_the_command_without_a_word():
+def test_a_reader_that_goes_away_ends_the_command_without_a_word(folder):
     """As `head` does, after it has read enough."""
     with subprocess.Popen(
-        [sys.executable, "-m", "kfopc_filterpy", "data", "list"], env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        [sys.executable, "-m", "kfopc_filterpy", "paths", "inspect", "S.wav"], cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     ) as process:  # fmt: skip
         process.stdout.close()
         assert process.stderr.read() == b""

@@ -144,15 +144,15 @@ def test_each_study_asks_for_its_recording(name: str, noise: str) -> None:
     main, _ = (STUDIES | FURTHER)[name]
     asked = []
 
-    def unavailable(**options: Any) -> None:
-        asked.append(options)
+    def unavailable(noise: str) -> None:
+        asked.append(noise)
         raise duct.DataUnavailableError("no file")
 
     with smaller(duct, load_measured_duct=unavailable):
         line = main(Runs())
     assert line.startswith(f"{name} is left out: set KFOPC_DATA to a folder with the measured data")
     assert line.endswith("(no file)")
-    assert asked == [{"noise": noise, "allow_download": True}]
+    assert asked == [noise]
 
 
 def test_figures_are_over_the_rated_power(scene: Any) -> None:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from comparisons.bench.measured import DataUnavailableError, load_measured_duct
 from kfopc_filterpy import (
     bandpass_path,
     kf_anc,
@@ -27,11 +28,9 @@ from kfopc_filterpy import (
 from kfopc_filterpy.bounds import SuggestedSettings, wiener_solution
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.signals import (
-    DataUnavailableError,
     band_limited_noise,
     bursty_noise,
     compressor_noise,
-    load_measured_duct,
     looped,
     scaled_to_power,
     swelling,
@@ -150,7 +149,7 @@ def main() -> None:
     paths, noises = made_paths(), dict(NOISES)
     try:
         for name, apart_s in (("motor", 5.0), ("compressor", 8.0)):  # the run begins so much later in the recording
-            measured = load_measured_duct(noise=name)
+            measured = load_measured_duct(name)
             recording = measured.noise - measured.noise.mean()
             noises[f"recorded {name}"] = lambda duration, seed, recording=recording, apart_s=apart_s: looped(
                 recording, duration, fs=FS, start_s=apart_s * (seed - 1)

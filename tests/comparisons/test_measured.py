@@ -1,0 +1,191 @@
+"""The measured duct and room, and their fetch from a server on this machine; no test reaches beyond it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import numpy as np
+import pooch
+import pytest
+import scipy.io
+
+from comparisons.__main__ import main
+from comparisons.bench import measured
+from comparisons.bench.measured import SHA256, DataUnavailableError, fetch, load_measured_duct, load_measured_room
+
+EACH = range(1, 5)
+
+
+# ---- The published files
+
+
+def test_pinned_hashes_are_those_of_the_published_files(shared_data: Path) -> None:
+    files = [name for name in SHA256 if (shared_data / name).is_file()]
+    assert len(files) >= 4
+    for name in files:
+        assert hashlib.sha256((shared_data / name).read_bytes()).hexdigest() == SHA256[name]
+
+
+@pytest.mark.parametrize(
+    ("noise", "file", "variable"),
+    [("motor", "Motor.mat", "Motor_noise"), ("compressor", "compressor_16kHz.mat", "yr")],
+)
+def test_published_duct_has_its_known_contents(
+    shared_data: Path, data_folder: Any, noise: str, file: str, variable: str
+) -> None:
+    data_folder(shared_data)
+    duct = load_measured_duct(noise)
+    assert (duct.primary.shape, duct.secondary.shape, duct.fs) == ((1024,), (512,), 16000)
+    for name, key, found in (
+        ("duct/Pz1.mat", "Pz1", duct.primary),
+        ("duct/Sz.mat", "S", duct.secondary),
+        (f"{noise}/{file}", variable, duct.noise),
+    ):
+        np.testing.assert_array_equal(found, scipy.io.loadmat(shared_data / name)[key][:, 0])
+    # The secondary path gains 10 to 30 dB in the middle of 200 to 2000 Hz.
+    gain_db = 20 * np.log10(np.abs(np.fft.rfft(duct.secondary, 4096)))[52:513]
+    assert 10 < np.median(gain_db) < 30
+
+
+def test_published_room_has_its_known_contents(shared_data: Path, data_folder: Any) -> None:
+    if not (shared_data / "room4x4").is_dir():
+        pytest.skip(f"no measured room: {shared_data} has no folder room4x4")
+    data_folder(shared_data)
+    room = load_measured_room()
+    assert (room.primary.shape, room.secondary.shape, room.fs) == ((4, 1, 256), (4, 4, 256), 16000)
+    # The noise arrives 30 samples in, after every loudspeaker's sound: control is causal.
+    share = np.cumsum(room.secondary**2, axis=2) / np.sum(room.secondary**2, axis=2)[..., None]
+    onset = np.argmax(share > 0.01, axis=2)
+    assert 8 <= onset.min() < onset.max() <= 14
+
+
+# ---- Small files in their place
+
+
+class Source(ThreadingHTTPServer):
+    """A server of a folder's files by their names; `asked` has the paths asked for, `fault` what is wrong with it."""
+
+    daemon_threads = True
+
+    def __init__(self, folder: Path) -> None:
+        source, self.asked, self.fault = self, [], ""
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                source.asked.append(self.path)
+                content = next(folder.glob(f"*/{Path(self.path).name}")).read_bytes()
+                if source.fault == "missing":
+                    return self.send_error(404)
+                self.send_response(200)
+                self.send_header("Content-Length", str(len(content)))
+                self.end_headers()
+                changed = content[:-1] + b"x" if source.fault == "changed" else content
+                self.wfile.write(changed[: len(content) // 2] if source.fault == "cut" else changed)
+                return None
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        super().__init__(("127.0.0.1", 0), Handler)
+
+
+@pytest.fixture
+def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Source]:
+    """A server of small files in place of the published ones: S{k}{j} holds k and j. The cache is a new folder."""
+    contents = {"duct/Pz1": "Pz1", "duct/Sz": "S", "motor/Motor": "Motor_noise", "compressor/compressor_16kHz": "yr"}
+    files = {f"{name}.mat": {key: [[1.0], [2.0], [3.0]]} for name, key in contents.items()}
+    for name in (*(f"P{k}" for k in EACH), *(f"S{k}{j}" for k in EACH for j in EACH)):
+        files[f"room4x4/{name}.mat"] = {name: [[float(digit)] for digit in name[1:]]}
+    assert files.keys() == SHA256.keys()
+    for name, content in files.items():
+        path = tmp_path / "published" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scipy.io.savemat(path, content)
+        monkeypatch.setitem(SHA256, name, hashlib.sha256(path.read_bytes()).hexdigest())
+    for name in ("http_proxy", "https_proxy", "all_proxy", "HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "KFOPC_DATA"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pooch, "os_cache", lambda name: tmp_path / "cache" / name)
+    with Source(tmp_path / "published") as server:
+        monkeypatch.setattr(measured, "HOST", f"http://127.0.0.1:{server.server_port}")
+        thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def left_in(folder: Path) -> list[str]:
+    """Return the names of all files in a folder."""
+    return sorted(path.name for path in folder.rglob("*") if path.is_file())
+
+
+def test_without_a_folder_each_file_is_fetched_once_to_the_cache(source: Source, tmp_path: Path) -> None:
+    for _ in range(2):
+        duct = load_measured_duct("motor")
+        assert [duct.primary.tolist(), duct.secondary.tolist(), duct.noise.tolist()] == 3 * [[1.0, 2.0, 3.0]]
+    assert [Path(path).name for path in source.asked] == ["Pz1.mat", "Sz.mat", "Motor.mat"]
+    for path, repository in zip(source.asked, ["Luo-Zhengding", "Luo-Zhengding", "Ji-Junwei"], strict=True):
+        assert path.startswith(f"/{repository}/")
+        assert " " not in path
+    assert left_in(tmp_path / "cache" / "kfopc_filterpy") == ["Motor.mat", "Pz1.mat", "Sz.mat"]
+
+
+def test_first_index_of_the_room_is_the_microphone_and_second_the_loudspeaker(source: Source) -> None:
+    room = load_measured_room()
+    assert room.primary.tolist() == [[[k]] for k in EACH]
+    assert room.secondary.tolist() == [[[k, j] for j in EACH] for k in EACH]
+
+
+def test_a_folder_that_is_named_is_read_and_nothing_is_fetched(
+    source: Source, data_folder: Any, tmp_path: Path
+) -> None:
+    data_folder(tmp_path / "published")
+    assert load_measured_duct("compressor").noise.tolist() == [1.0, 2.0, 3.0]
+    (tmp_path / "published" / "duct" / "Sz.mat").unlink()
+    with pytest.raises(DataUnavailableError, match=r"Sz\.mat is missing: python -m comparisons data fetches it"):
+        load_measured_duct("compressor")
+    assert source.asked == []
+
+
+def test_the_command_fetches_all_to_the_folder_that_is_named(
+    source: Source, data_folder: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "measured"
+    data_folder(folder)
+    assert main(["data"]) == 0
+    assert capsys.readouterr().out == f"{folder}\n"
+    assert left_in(folder) == sorted(Path(name).name for name in SHA256)
+    assert load_measured_room().secondary[3, 1].tolist() == [4, 2]
+    (folder / "duct" / "Pz1.mat").write_bytes(b"measured by the user")
+    with pytest.raises(SystemExit):
+        main(["data"])
+    assert "Pz1.mat is not at hand" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [("changed", "does not match"), ("cut", "IncompleteRead|Connection broken"), ("missing", "404 Client Error")],
+)
+def test_a_fetch_that_fails_leaves_nothing(source: Source, tmp_path: Path, fault: str, reason: str) -> None:
+    source.fault = fault
+    with pytest.raises(DataUnavailableError, match=rf"(?s)Pz1\.mat is not at hand \(.*({reason}).*\): set KFOPC_DATA"):
+        load_measured_duct("motor")
+    assert len(source.asked) == 1
+    assert left_in(tmp_path / "cache") == []
+    source.fault = ""
+    assert fetch("duct/Pz1.mat").is_file()
+
+
+def test_a_file_that_differs_is_refused_and_not_overwritten(source: Source, data_folder: Any, tmp_path: Path) -> None:
+    data_folder(tmp_path / "published")
+    path = tmp_path / "published" / "duct" / "Pz1.mat"
+    path.write_bytes(b"measured by the user")
+    with pytest.raises(DataUnavailableError, match=r"delete a file that is not the published one"):
+        load_measured_duct("motor")
+    assert path.read_bytes() == b"measured by the user"
+    assert source.asked == []
