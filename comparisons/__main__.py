@@ -24,7 +24,7 @@ def _study(module: str, main: str = "main") -> Study:
 
 ALONE = {  # with options of their own
     "speed": ".speed.study",
-    "sweep": ".sweep.command",
+    "sweep": ".sweep.study",
     "soak": ".soak.study",
     "board": ".board.study",
     "benchmark": ".benchmark.study",

@@ -1,1 +1,1 @@
-"""Sweeps: the Monte-Carlo engine."""
+"""Sweeps: a grid of values and seeds, a row for each run."""

@@ -1,355 +1,337 @@
-"""A sweep's grid, tables, folder, figure and command line, with scenarios that take no time."""
+"""A sweep: rows that a run can go on from, failures as rows, and the built-in scenario equal to plain runs."""
 
 from __future__ import annotations
 
-import csv
 import json
 import math
-import shutil
-from contextlib import chdir
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.studies import plain_run, smaller
 from scipy import stats
 
 from comparisons.__main__ import main
-from comparisons.sweep.command import parsed_values
-from comparisons.sweep.grid import AXES, built_in_grid, own_grid
-from comparisons.sweep.results import cell_rows, mean_and_interval, sweep_figure
-from comparisons.sweep.run import run_sweep
-from comparisons.sweep.scenario import ScenarioError
-from comparisons.sweep.store import keep, kept
+from comparisons.bench import Runs, Scene, algorithms, tune
+from comparisons.studies.cases import FS, SWITCH_ON_S, make_case, noises, paths
+from comparisons.sweep import scenario, study
+from comparisons.sweep.scenario import DEFAULTS, checked_axes, in_the_loop, scene_of
+from comparisons.sweep.study import means, parsed, rows_of, run_sweep
+from kfopc_filterpy import (
+    HardClipAmplifier,
+    SoftSaturationAmplifier,
+    noise_reduction_db,
+    output_power,
+    power_constrained_wiener,
+)
+from kfopc_filterpy.paths import path_taps, perturbed_path
+from kfopc_filterpy.verdict.runs import AllDivergedError
 
-CALLS: list[tuple] = []
+CALLS: list[int] = []
+SMALL = {"duration_s": 0.5, "n_taps": 24}
+AXES = {"slope": [1.0, 2.0, 3.0], "kind": ["a", "b"]}
 
 
-def plane(scenario):
-    CALLS.append((scenario["slope"], scenario["kind"], scenario["seed"]))
-    noise = np.random.default_rng(scenario["seed"]).standard_normal()
-    return {"height": 2.0 * scenario["slope"] + noise, "count": 3}
+def plane(values):
+    CALLS.append(values["seed"])
+    return {"height": values["slope"] * np.random.default_rng(values["seed"]).standard_normal(), "none": math.inf}
 
 
-def moody(scenario):
-    if scenario["seed"] == 2 or scenario["mood"] == "bad":
-        return {"height": None, "diverged": True}
-    if scenario["mood"] == "broken":
+def moody(values):
+    if values["mood"] == "broken":
         raise ArithmeticError("out of mood")
-    return {"height": 1.0}
+    return {"height": None} if values["mood"] == "bad" else {"height": 1, "diverged": values["seed"] == 2}
 
 
-def swept(folder, grid=None, scenario=plane, **options):
-    grid = {"slope": [1.0, 2.0, 3.0], "kind": ["a", "b"]} if grid is None else grid
-    return run_sweep(grid, folder, scenario=scenario, **({"seeds": 4, "jobs": 1, "quiet": True} | options))
+def built_in(file, axes, **options):
+    return run_sweep(in_the_loop, SMALL | axes, file, **{"seeds": 2, "jobs": 1} | options)
 
 
-@pytest.fixture(scope="module")
-def first(tmp_path_factory):
-    """A sweep of 24 runs, and its folder."""
-    folder = tmp_path_factory.mktemp("sweep")
-    return swept(folder), folder
+# Rows.
 
 
-@pytest.fixture
-def done(first, tmp_path):
-    """The sweep, and a copy of its folder."""
-    return first[0], shutil.copytree(first[1], tmp_path / "done")
-
-
-def read_csv(path):
-    with open(path, newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-# The grid.
-
-
-def test_every_combination_has_a_run_for_each_seed():
-    grid = own_grid({"a": [1, 2], "b": "x", "c": (None, True, 0.5)}, [5, 0])
-    runs = grid.runs()
-    assert len(runs) == 2 * 1 * 3 * 2
-    assert [(run["a"], run["c"], run["seed"]) for run in runs[:5]] == [
-        (1, None, 5),
-        (1, None, 0),
-        (1, True, 5),
-        (1, True, 0),
-        (1, 0.5, 5),
+@pytest.mark.parametrize("cut", [0, 1, 20])
+def test_a_sweep_goes_on_where_it_ended_and_gives_equal_rows(tmp_path, cut):
+    whole = run_sweep(plane, AXES, tmp_path / "whole", seeds=4, jobs=1)
+    assert [(row["slope"], row["kind"], row["seed"]) for row in whole[:5]] == [
+        *((1.0, "a", seed) for seed in (1, 2, 3, 4)),
+        (1.0, "b", 1),
     ]
-    assert runs[3] == {"a": 1, "b": "x", "c": True, "seed": 0}
-    assert grid.swept == ["a", "c"]
+    lines = (tmp_path / "whole").read_bytes().splitlines(keepends=True)
+    begun = b"".join(lines[:10])[: -cut or None]  # of the last line, the kernel wrote a part
+    (tmp_path / "begun").write_bytes(begun)
+    CALLS.clear()
+    assert run_sweep(plane, AXES, tmp_path / "begun", seeds=4, jobs=1) == whole
+    assert len(CALLS) == 24 - (10 if cut < 2 else 9)  # without its newline alone, the line is whole
+    assert (tmp_path / "begun").read_bytes().startswith(begun)  # nothing is rewritten
+    CALLS.clear()
+    more = run_sweep(plane, AXES | {"slope": [2.0, 5.0]}, tmp_path / "begun", seeds=4, jobs=1)
+    assert len(CALLS) == 8  # of slope 5: those of slope 2 are there
+    assert more[:8] == whole[8:16]
 
 
-def test_axes_not_named_have_their_default():
-    grid = built_in_grid({"rated_power_db": [-20, -10.0], "algorithm": "kf-pb"}, 2)
-    assert list(grid.axes) == list(AXES)
-    assert grid.axes["rated_power_db"] == (-20.0, -10.0)
-    assert grid.axes["algorithm"] == ("KF-PB",)  # the name as the studies write it
-    assert grid.axes["n_taps"] == (128,)
-    assert grid.seeds == (1, 2)
+def test_rows_of_other_code_or_another_scenario_are_left_alone(tmp_path):
+    before = run_sweep(plane, {"slope": 1.0}, tmp_path / "rows", seeds=2, jobs=1)
+    CALLS.clear()
+    with smaller(study, code_of=lambda scenario: "other"):
+        after = run_sweep(plane, {"slope": 1.0}, tmp_path / "rows", seeds=2, jobs=1)
+    assert len(CALLS) == 2
+    assert rows_of(tmp_path / "rows") == before + after
+    assert study.code_of(plane) not in (study.code_of(moody), study.code_of(in_the_loop))
+
+
+def test_a_run_that_fails_is_a_row_with_its_reason(tmp_path):
+    rows = run_sweep(moody, {"mood": ["broken", "good", "bad"]}, tmp_path / "rows", seeds=3, jobs=1)
+    assert [row.get("error") for row in rows] == ["ArithmeticError: out of mood"] * 3 + [None] * 6
+    broken, good, bad = means(rows, ["mood"])
+    assert (broken["runs"], broken["failed"], broken["height"]) == (3, 3, None)
+    assert (good["failed"], good["diverged"], good["height"]) == (0, 1, (1.0, 0.0))
+    assert (bad["failed"], bad["diverged"], bad["height"]) == (0, 0, None)
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [(3.0, "AttributeError"), ({"a": "b"}, "TypeError"), ({"mood": 1.0}, "the figure 'mood' has the name of an axis")],
+)
+def test_what_a_scenario_returns_is_checked(returned, message, tmp_path):
+    (row,) = run_sweep(lambda values: returned, {"mood": "good"}, tmp_path / "rows", seeds=1, jobs=1)
+    assert message in row["error"]
+
+
+def test_numbers_survive_the_file_exactly(tmp_path):
+    rows = run_sweep(plane, AXES, tmp_path / "rows", seeds=4, jobs=1)
+    assert rows_of(tmp_path / "rows") == rows
+    rng = np.random.default_rng(2)
+    assert (rows[1]["height"], rows[1]["none"]) == (rng.standard_normal(), None)
+
+
+@pytest.mark.parametrize(
+    ("axes", "seeds", "message"),
+    [
+        ({"a": 1}, 0, "seed must have at least one value"),
+        ({"a": 1}, [1, 1], "none twice"),
+        ({"a": []}, 1, "a must have at least one value"),
+        ({"seed": [1]}, 1, "no axis be called seed"),
+    ],
+)
+def test_axes_and_seeds_refused(tmp_path, axes, seeds, message):
+    with pytest.raises(ValueError, match=message):
+        run_sweep(plane, axes, tmp_path / "rows", seeds=seeds)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_interval_is_that_of_scipy():
+    values = np.random.default_rng(1).normal(3.0, 2.0, 9)
+    ((mean, half),) = (cell["x"] for cell in means([{"x": value} for value in values], []))
+    expected = stats.t.interval(0.95, 8, loc=np.mean(values), scale=stats.sem(values))
+    np.testing.assert_allclose((mean - half, mean + half), expected, rtol=1e-12)  # the same in another order
+    assert means([{"x": 5.0}], [])[0]["x"] == (5.0, None)
+
+
+# Workers.
+
+
+def test_results_do_not_depend_on_the_number_of_processes(tmp_path):
+    axes = {"algorithm": ["KF-OPC", "KF-PB", "FxLMS"], "rated_power_db": [-20, -5]}
+    one, two = (built_in(tmp_path / f"{jobs}", axes, jobs=jobs) for jobs in (1, 2))
+    assert one == two
+    assert not any("error" in row for row in one)
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_rows_of_this_machine_and_goes_on_when_workers_die(tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="Dask's distributed is not installed")
+    (tmp_path / "own_fatal.py").write_text(
+        "import os\ndef fatal(values):\n    if values['a'] == 3:\n        os.kill(os.getpid(), 9)\n    return {'b': 1.0}\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    axes = {"rated_power_db": [-20, -10, -5]}
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        there = built_in(tmp_path / "there", axes, scheduler=cluster.scheduler_address)
+        fatal = __import__("own_fatal").fatal
+        rows = run_sweep(fatal, {"a": [1, 2, 3]}, tmp_path / "rows", seeds=1, scheduler=cluster.scheduler_address)
+    assert there == built_in(tmp_path / "here", axes)
+    assert [row.get("b") for row in rows] == [1.0, 1.0, None]
+    assert rows[2]["error"].startswith("KilledWorker: ")
+
+
+def test_a_scheduler_that_is_not_there_is_refused(tmp_path):
+    pytest.importorskip("distributed", reason="Dask's distributed is not installed")
+    with (
+        smaller(study, CONNECT_S=1.0),
+        pytest.raises(OSError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"),
+    ):
+        run_sweep(plane, AXES, tmp_path / "rows", scheduler="tcp://127.0.0.1:9")
+
+
+def test_without_dask_a_scheduler_says_what_to_install(uninstall, tmp_path):
+    uninstall("distributed")
+    with pytest.raises(ModuleNotFoundError, match="a scheduler needs Dask: python -m pip install"):
+        run_sweep(plane, AXES, tmp_path / "rows", scheduler="tcp://127.0.0.1:9")
+
+
+# The built-in scenario.
+
+
+def of_simulate(values):
+    """The scenario as a user would write it."""
+    values = DEFAULTS | values
+    noise = noises()[values["noise"]](values["duration_s"] + SWITCH_ON_S, values["seed"])
+    about = {name: values[name] for name in ("n_taps", "sensor_noise_db", "seed")}
+    scene = make_case(paths()[values["path"]], noise, **about)
+    rated = 10 ** (values["rated_power_db"] / 10)
+    errors = {"gain_db": values["path_gain_db"], "delay_samples": values["path_delay"]}
+    estimate = path_taps(perturbed_path(scene.secondary, fs=FS, phase_deg=values["path_phase_deg"], **errors))
+    limit = math.sqrt(2 * rated) * 10 ** (values["amplifier_limit_db"] / 20)
+    amplifiers = {"linear": None, "hard clip": HardClipAmplifier(limit), "soft": SoftSaturationAmplifier(limit)}
+    scene = replace(scene, secondary_estimate=estimate, rated_power=rated)
+    return plain_run(scene, values["algorithm"], values["setting"], amplifier=amplifiers[values["amplifier"]])
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "amplifier"),
+    [("KF-OPC", "linear"), ("KF-PB", "hard clip"), ("FxLMS", "soft"), ("FxRLS", "hard clip")],
+)
+def test_runs_are_those_of_simulate(algorithm, amplifier):
+    first = sorted(algorithms()[algorithm].first)
+    values = SMALL | {
+        "algorithm": algorithm,
+        "amplifier": amplifier,
+        "amplifier_limit_db": -2.0,
+        "rated_power_db": -6.0,
+        "path": "band-pass",
+        "noise": "tone",
+        "path_gain_db": 2.0,
+        "path_phase_deg": 20.0,
+        "path_delay": 1,
+        "sensor_noise_db": -30.0,
+        "setting": first[len(first) // 2],
+        "seed": 3,
+    }
+    figures, result = in_the_loop(values), of_simulate(values)
+    power = output_power(result.control_signal)
+    assert figures["noise_reduction_db"] == noise_reduction_db(result.error, result.disturbance)
+    assert figures["output_power_db"] == pytest.approx(10 * math.log10(power), abs=1e-12)
+    assert figures["power_over_rated"] == pytest.approx(power / 10**-0.6, rel=1e-12)
+    assert in_the_loop(values | {"setting": "default"}) == figures
+
+
+def test_the_rated_power_is_relative_to_what_the_unconstrained_filter_needs():
+    scene = scene_of(DEFAULTS | {"duration_s": 1.0, "n_taps": 32, "seed": 3})
+    ridge = scene.measurement_noise / (scene.settled[0].size * scene.initial_variance)
+    signals = scene.references[0], scene.disturbances[0], scene.secondary
+    bound = power_constrained_wiener(*signals, 32, 1.0, fs=scene.fs, switch_on_s=SWITCH_ON_S, ridge=ridge)
+    assert bound.unconstrained.control_power == pytest.approx(1.0, rel=1e-6)  # least squares of 16000 samples
+
+
+def test_a_setting_that_is_tuned_is_the_winner_of_the_studies_rule():
+    values = DEFAULTS | SMALL | {"noise": "tone", "setting": "tuned", "seed": 1}
+    for algorithm in ("FxLMS", "leaky FxLMS"):
+        best = tune(Runs(), scene_of(values | {"seed": scenario.TUNING_SEED}), [algorithm])[algorithm].setting
+        figures = in_the_loop(values | {"algorithm": algorithm})
+        used = figures["setting_used"], figures.get("second_setting_used")
+        assert used == (best if isinstance(best, tuple) else (best, None))
+
+
+def test_what_diverges_has_no_figures_of_merit():
+    values = SMALL | {"path_phase_deg": 180.0, "noise": "tone", "seed": 1}  # an estimate of the wrong sign
+    assert in_the_loop(values | {"algorithm": "KF-ANC"}) == {"setting_used": 1e-6, "diverged": True}
+    assert not in_the_loop(values | {"algorithm": "KF-OPC"})["diverged"]  # the rated power does not let it
+
+    def refuse(*arguments, **options):
+        error = ValueError("P is not positive definite")
+        error.add_note("in sample 3 of the run")
+        raise error
+
+    def all_diverged(*arguments, **options):
+        raise AllDivergedError("at every setting")
+
+    with smaller(Scene, run=refuse):
+        assert in_the_loop(values | {"algorithm": "FxRLS"})["diverged"]
+    with smaller(scenario, tune=all_diverged):
+        assert in_the_loop(values | {"algorithm": "FxLMS", "setting": "tuned", "n_taps": 20}) == {"diverged": True}
+
+
+def test_measured_paths_are_used_where_they_are_at_hand_and_asked_for_where_not(shared_data, data_folder):
+    values = SMALL | {"path": "measured duct", "noise": "motor", "seed": 1}
+    with smaller(), pytest.raises(ValueError, match="motor needs the measured data: set KFOPC_DATA"):
+        in_the_loop(values)
+    data_folder(shared_data)
+    scenario.cases.measured_data.cache_clear()
+    assert math.isfinite(in_the_loop(values)["noise_reduction_db"])
 
 
 @pytest.mark.parametrize(
     ("axes", "message"),
     [
-        ({"colour": "red"}, "no axis called colour; there are path, noise"),
-        ({"algorithm": "KF-XYZ"}, "algorithm must be one of KF-ANC, KF-OPC, .*got 'KF-XYZ'"),
-        ({"algorithm": ["KF-OPC", "leaky FxLMS"]}, r'leaky FxLMS has two settings.*give setting "tuned"'),
-        ({"path_delay": "late"}, "path_delay must be one of a number, got 'late'"),
-        ({"algorithm": []}, "algorithm must have at least one value"),
-        ({"n_taps": 0}, "n_taps must be at least 1, got 0"),
-        ({"duration_s": [1.0, 0.0]}, "duration_s must be"),
-        ({"setting": "best"}, "setting must be one of default, tuned, a number, got 'best'"),
-        ({"rated_power_db": math.nan}, "rated_power_db must be"),
-        ({"rated_power_db": [-10, -10.0]}, "rated_power_db must have at least one value, and none twice"),
+        ({"colour": ["red"]}, "no axis called colour; there are path, noise"),
+        ({"algorithm": ["KF-XYZ"]}, "algorithm must be one of KF-ANC, KF-OPC, .*got 'KF-XYZ'"),
+        ({"path_delay": ["late"]}, "path_delay must be a single number"),
+        ({"setting": ["best"]}, "setting must be a single number"),
+        ({"rated_power_db": [math.nan]}, "rated_power_db must be finite"),
     ],
 )
-def test_grid_refuses_what_is_no_axis_or_value(axes, message):
-    with pytest.raises(ValueError, match=message):
-        built_in_grid(axes, 1)
+def test_axes_of_the_built_in_scenario_are_checked(axes, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        checked_axes(axes)
 
 
-@pytest.mark.parametrize(
-    ("axes", "seeds", "error", "message"),
-    [
-        ({"a": 1}, 0, ValueError, "seeds must be at least 1"),
-        ({"a": 1}, [1, 1], ValueError, "seeds must have at least one value, and none twice"),
-        ({"a": 1}, [-1], ValueError, "seeds must be at least 0"),
-        ({}, 1, ValueError, "grid must have at least one axis"),
-        ({"seed": [1]}, 1, ValueError, 'none called "seed"'),
-        ({"a": [math.inf]}, 1, ValueError, "a must be finite"),
-        ({"a": [object()]}, 1, TypeError, "a must hold numbers, strings, booleans or None, got object"),
-    ],
-)
-def test_own_axes_and_seeds_refused(axes, seeds, error, message):
-    with pytest.raises(error, match=message):
-        own_grid(axes, seeds)
+# The command.
 
 
-# Means and intervals.
+def test_the_command_prints_means_and_goes_on(tmp_path, capsys):
+    command = ["sweep", "rated_power_db=-20,-10", "--seeds", "2", "duration_s=0.5", "n_taps=24", "--quiet", "--output"]
+    assert main([*command, str(tmp_path / "new" / "rows.jsonl")]) == 0
+    printed = capsys.readouterr()
+    head, low, high = (re.split(r"\s{2,}", line.strip()) for line in printed.out.splitlines()[:3])
+    assert [head[0], low[0], high[0], printed.err] == ["rated_power_db", "-20", "-10", ""]
+    assert all(" ± " in mean for mean in (*low[1:3], *high[1:3]))
+    assert "4 rows in" in printed.out
+    lines = (tmp_path / "new" / "rows.jsonl").read_text().splitlines()
+    assert {json.loads(line)["rated_power_db"] for line in lines} == {-20, -10}
+    assert main([*command, str(tmp_path / "new" / "rows.jsonl")]) == 0
+    assert capsys.readouterr().out == printed.out
 
 
-def test_interval_is_that_of_scipy():
-    values = np.random.default_rng(1).normal(3.0, 2.0, 9)
-    mean, low, high, count = mean_and_interval(values)
-    expected = stats.t.interval(0.95, 8, loc=np.mean(values), scale=stats.sem(values))
-    assert (mean, count) == (pytest.approx(np.mean(values)), 9)
-    np.testing.assert_allclose((low, high), expected, rtol=1e-12)  # the same formula, other order of operations
-
-
-def test_no_interval_for_one_seed_and_nothing_for_none():
-    np.testing.assert_equal(mean_and_interval([5.0]), (5.0, math.nan, math.nan, 1))
-    np.testing.assert_equal(mean_and_interval([math.nan]), (math.nan, math.nan, math.nan, 0))
-
-
-def test_divergence_is_counted_and_drops_no_cell(tmp_path):
-    sweep = swept(tmp_path, {"mood": ["good", "bad"]}, moody, seeds=3)
-    good, bad = sweep.cells
-    assert (good["runs"], good["diverged"], good["height_n"], good["height_mean"]) == (3, 1, 2, 1.0)
-    assert (bad["runs"], bad["diverged"], bad["height_n"]) == (3, 3, 0)
-    assert math.isnan(bad["height_mean"])
-    rows = read_csv(tmp_path / "cells.csv")
-    assert [row["height_mean"] for row in rows] == ["1.0", ""]
-    assert [row["diverged"] for row in read_csv(tmp_path / "runs.csv")] == ["False", "True", "False"] + 3 * ["True"]
-
-
-# Tables.
-
-
-def test_tables_hold_every_digit(done):
-    sweep, folder = done
-    rows = read_csv(folder / "runs.csv")
-    assert [float(row["height"]) for row in rows] == [run["height"] for run in sweep.runs]
-    assert [row["kind"] for row in rows[:8]] == 4 * ["a"] + 4 * ["b"]
-    assert list(rows[0]) == ["slope", "kind", "seed", "height", "count", "diverged"]
-
-
-def test_parquet_holds_what_csv_holds(tmp_path):
-    """A column of names and numbers becomes one of strings."""
-    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow, the extra parquet, is not installed")
-    sweep = swept(tmp_path, {"mood": ["good", "bad"], "level": [1, "loud"]}, moody, seeds=3, format="parquet")
-    assert [path.name for path in sweep.files[:2]] == ["cells.parquet", "runs.parquet"]
-    cells = parquet.read_table(tmp_path / "cells.parquet").to_pylist()
-    assert [cell["level"] for cell in cells] == ["1", "loud", "1", "loud"]
-    assert [cell["height_mean"] for cell in cells] == [1.0, 1.0, None, None]
-    assert not list(tmp_path.glob(".*"))  # no partial file left
-
-
-# The folder.
-
-
-@pytest.mark.parametrize("cut", [0, 1, 20])
-def test_what_is_done_is_not_done_again_and_a_torn_line_harms_no_other(done, cut):
-    first, folder = done
-    runs = folder / "runs.jsonl"
-    whole = runs.read_bytes()
-    kept = whole[: len(whole) - cut]  # the kernel wrote a part of the last line
-    runs.write_bytes(kept)
-    CALLS.clear()
-    again = swept(folder)
-    assert len(CALLS) == (1 if cut > 1 else 0)  # without its newline alone, the line is whole
-    assert (again.runs, again.cells) == (first.runs, first.cells)
-    assert runs.read_bytes().startswith(kept)  # nothing is rewritten
-
-
-def test_bytes_that_are_no_text_are_done_again(done):
-    first, folder = done
-    lines = (folder / "runs.jsonl").read_bytes().splitlines(keepends=True)
-    lines[3] = b"\0\xff" * 20 + b"\n"  # what a power cut may leave of a block
-    (folder / "runs.jsonl").write_bytes(b"".join(lines))
-    CALLS.clear()
-    for calls in (1, 1):  # and then no more
-        assert swept(folder).cells == first.cells
-        assert len(CALLS) == calls
-
-
-@pytest.mark.parametrize(
-    ("grid", "options", "message"),
-    [
-        ({"slope": [1.0, 2.0], "kind": ["a", "b"]}, {}, r"axis slope is .* there, but \[1\.0, 2\.0\] here"),
-        ({"slope": [1.0, 2.0, 3.0]}, {}, "axis kind is .* there, but null here"),
-        ({"kind": ["a", "b"], "slope": [1.0, 2.0, 3.0]}, {}, "its axes have another order"),
-        (None, {"seeds": 5}, r"seeds is \[1, 2, 3, 4\] there"),
-        (None, {"scenario": moody}, "scenario is .*plane.*moody"),
-    ],
-)
-def test_folder_of_another_sweep_is_refused(done, grid, options, message):
-    kept = (done[1] / "runs.jsonl").read_bytes()
-    with pytest.raises(ValueError, match=f"holds another sweep .{message}.*choose another output folder"):
-        swept(done[1], grid, **options)
-    assert (done[1] / "runs.jsonl").read_bytes() == kept
-
-
-def test_folder_of_other_code_is_refused(done):
-    description = json.loads((done[1] / "sweep.json").read_text())
-    (done[1] / "sweep.json").write_text(json.dumps(description | {"SHA-256 of the code": "0" * 64}))
-    with pytest.raises(ValueError, match="SHA-256 of the code is"):
-        swept(done[1])
-
-
-@pytest.mark.parametrize(("name", "text"), [("sweep.json", ""), ("sweep.json", "[1, 2]"), ("runs.jsonl", "")])
-def test_folder_without_a_description_is_refused(tmp_path, name, text):
-    (tmp_path / name).write_text(text)
-    with pytest.raises(ValueError, match=r"has no readable sweep\.json: choose another output folder"):
-        swept(tmp_path)
-
-
-def test_numbers_survive_the_folder_exactly(tmp_path):
-    figures = {"third": 1 / 3, "tiny": 5e-324, "none": math.nan, "endless": math.inf, "diverged": False}
-    keep(tmp_path, {1: figures})
-    read = kept(tmp_path)[1]
-    assert (read["third"], read["tiny"], read["diverged"]) == (1 / 3, 5e-324, False)
-    assert math.isnan(read["none"])
-    assert math.isnan(read["endless"])  # no finite figure
-
-
-# A scenario of one's own.
-
-
-def test_exception_names_the_scenario_and_keeps_what_was_done(tmp_path):
-    with pytest.raises(ScenarioError, match="scenario mood=broken, seed=1: ArithmeticError: out of mood"):
-        swept(tmp_path, {"mood": ["good", "broken"]}, moody, seeds=[1, 3])
-    assert len((tmp_path / "runs.jsonl").read_text().splitlines()) == 2
-
-
-@pytest.mark.parametrize(
-    ("returned", "message"),
-    [
-        (3.0, "dict of figures by name"),
-        ({1: 2.0}, "dict of figures by name"),
-        ({"a": "b"}, "figure 'a' .* must be a number"),
-        ({"mood": 1.0}, "figure 'mood' has the name of an axis"),
-    ],
-)
-def test_what_a_scenario_returns_is_checked(returned, message, tmp_path):
-    with pytest.raises(ScenarioError, match=message):
-        swept(tmp_path, {"mood": ["good"]}, lambda scenario: returned)
-
-
-def test_arguments_that_do_not_fit_are_refused(tmp_path):
-    with pytest.raises(TypeError, match="scenario must be a function"):
-        swept(tmp_path, scenario="plane")
-    with pytest.raises(ValueError, match="either jobs or scheduler"):
-        swept(tmp_path, scheduler="tcp://127.0.0.1:1")
-    with pytest.raises(ValueError, match="jobs must be at least 1"):
-        swept(tmp_path, jobs=0)
-
-
-# The figure.
-
-
-def test_figure_shows_the_means_and_intervals():
-    grid = own_grid({"slope": [3.0, 1.0], "kind": ["a", "b"], "level": [5]}, 3)
-    figures = [
-        {
-            "height": run["slope"] * run["seed"] + (run["kind"] == "b"),
-            "diverged": run["kind"] == "a" and run["seed"] > 3,
-        }
-        for run in grid.runs()
-    ]
-    (ax,) = sweep_figure(grid, cell_rows(grid, figures), ["height"]).axes
-    lines, bars = zip(*[(c.lines[0], c.lines[2][0]) for c in ax.containers], strict=True)
-    for line, own, kind in zip(lines, bars, ("a", "b"), strict=True):
-        np.testing.assert_array_equal(line.get_xdata(), [1.0, 3.0])  # in order, whatever the grid's
-        np.testing.assert_allclose(line.get_ydata(), np.array([2.0, 6.0]) + (kind == "b"))
-        half = stats.t.ppf(0.975, 2) / np.sqrt(3)  # of seeds 1, 2, 3
-        ends = np.array([segment[:, 1] for segment in own.get_segments()])
-        np.testing.assert_allclose(ends[:, 1] - ends[:, 0], 2 * half * np.array([1.0, 3.0]))
-    assert ax.get_legend_handles_labels()[1] == ["a", "b"]
-
-
-# The command line.
-
-
-@pytest.mark.parametrize("text", ["1,,2", "1:2", "1:2:1", "1:2:3:4", "a:b:3", "0:1:3:log", "1:inf:3"])
-def test_lists_refused(text):
-    with pytest.raises(ValueError, match="axis must be values separated by commas, or first:last:count"):
-        parsed_values(text, "axis")
-
-
-OWN_MODULE = """
-def slope(scenario):
-    if scenario["side"] == "wrong":
-        raise ValueError("no such side")
-    return {"height": scenario["a"] * scenario["seed"]}
-"""
-
-
-@pytest.fixture
-def module(tmp_path, monkeypatch):
-    (tmp_path / "own_sweep_module.py").write_text(OWN_MODULE)
+def test_the_command_runs_a_function_of_ones_own_and_says_what_failed(tmp_path, monkeypatch, capsys):
+    (tmp_path / "own_sweep.py").write_text("def f(values):\n    return {'b': 1 / values['a']}\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    with chdir(tmp_path):
-        yield "own_sweep_module:slope"
+    arguments = ["sweep", "--scenario", "own_sweep:f", "a=-1:1:3", "--seeds", "7", "--jobs", "1", "--quiet"]
+    assert main([*arguments, "--output", str(tmp_path / "rows")]) == 1
+    assert "failed: a=0, seed=1: ZeroDivisionError: division by zero" in capsys.readouterr().err
+    assert [row["b"] for row in rows_of(tmp_path / "rows") if row["a"] == -1] == [-1.0] * 7
 
 
-def test_command_sweeps_a_function_of_ones_own(module, tmp_path, capsys):
-    arguments = ["sweep", "--scenario", module, "--axis", "a=-1:1:3", "--seeds", "1,3", "--jobs", "1", "--quiet"]
-    assert main([*arguments, "--axis", "side=left,right", "--output", "out"]) == 0
-    assert "12 runs, 0 of them diverged, 6 cells" in capsys.readouterr().out
-    rows = read_csv(tmp_path / "out" / "cells.csv")
-    assert [float(row["height_mean"]) for row in rows] == [-2.0, -2.0, 0.0, 0.0, 2.0, 2.0]
-    assert (tmp_path / "out" / "figures" / "a.svg").exists()
-    assert main([*arguments, "--axis", "side=wrong", "--output", "failed"]) == 1
-    said = capsys.readouterr().err
-    assert "scenario a=-1, side=wrong, seed=1: ValueError: no such side\nFinished runs are kept in failed" in said
+def test_an_interrupted_command_says_how_to_go_on(tmp_path, capsys):
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    with smaller(study, run_sweep=interrupted):
+        assert main(["sweep", "--output", str(tmp_path / "rows")]) == study.INTERRUPTED
+    assert "interrupted; the same command goes on from" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--n-taps", "0"], "n_taps must be at least 1"),
-        (["--n-taps", "64,"], "n_taps must be values separated by commas"),
-        (["--axis", "a=1"], "no axis called a; there are path"),
-        (["--scenario", "math", "--axis", "a=1"], "scenario must be a function"),
-        (["--scenario", "math:no_such_function", "--axis", "a=1"], "'math' has no attribute 'no_such_function'"),
-        (["--scenario", "no_such_module:f", "--axis", "a=1"], "No module named 'no_such_module'"),
-        (["--scenario", "math:sqrt"], "grid must have at least one axis"),
-        (["--scenario", "math:sqrt", "--axis", "a"], "--axis must be NAME=VALUES"),
-        (["--scheduler", "tcp://127.0.0.1:1"], "not allowed with argument"),
+        (["n_taps=64,"], "n_taps must be values separated by commas"),
+        (["n_taps=1:2"], "n_taps must be values separated by commas"),
+        (["n_taps"], "n_taps must be values separated by commas"),
+        (["a=1"], "no axis called a; there are path"),
+        (["--scenario", "math:no_such_function", "a=1"], "'math' has no attribute 'no_such_function'"),
+        (["--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"], "not allowed with argument"),
     ],
 )
-def test_command_refuses(inside, capsys, arguments, message):
+def test_the_command_refuses(inside, capsys, arguments, message):
     with pytest.raises(SystemExit) as refused:
-        main(["sweep", "--jobs", "1", "--quiet", *arguments])
+        main(["sweep", "--quiet", *arguments])
     assert refused.value.code == 2
     assert message in capsys.readouterr().err
     assert not list(inside.iterdir())  # nothing was begun
+
+
+@pytest.mark.parametrize("text", ["1,,2", "1:2:3:4", "1:2:3:4:5"])
+def test_lists_refused(text):
+    with pytest.raises(ValueError, match="axis must be values separated by commas"):
+        parsed(text, "axis")
