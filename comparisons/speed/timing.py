@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..bench.report import aligned
+from kfopc_filterpy.verdict.items import aligned
 
 Work = tuple[Callable[[], Any], int]  # runs some samples, and how many
 Tick = Callable[[], Any]  # called after each row of a table

@@ -28,9 +28,9 @@ from scipy.stats import t as student
 from tqdm import tqdm
 
 import kfopc_filterpy
+from kfopc_filterpy.verdict.items import aligned
 from kfopc_filterpy.verdict.runs import one_blas_thread
 
-from ..bench.report import aligned
 from .scenario import DEFAULTS, checked_axes, in_the_loop
 
 CONFIDENCE = 0.95
