@@ -47,7 +47,7 @@ from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_
 
 from .._types import PathModels, ProgressBar
 from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on
-from .candidates import CANDIDATES, DIRECT, ONE_CHANNEL
+from .candidates import CANDIDATES, CHOSEN, DIRECT, ONE_CHANNEL, Settings
 from .fixed_filters import FixedFilters, longest_filter
 from .limits import Limits, Ratings, excursion_mm, limits_of, ratings_of_each, scale_of, watt_per_power, with_excursion
 from .runs import NSE_WINDOW_S, Plan, announce, one_blas_thread
@@ -273,7 +273,7 @@ def assess(
         least = _least_share(plan, algorithm, want_db, np.max(first / limits.rated_power), unit)
     if cause == "adaptation" and np.isfinite(least):
         cause = "amplifier"
-    figures = {name: _figures(one, limits, fs) for name, one in runs.items()}
+    figures = {name: _figures(one, limits, fs, plan.chosen[name]) for name, one in runs.items()}
     notes += _on_better_runs(figures, algorithm) + _on_louder_bands(run)
     if watts is None:
         unknown = "the rating states no impedance" if ohm is None else "volts_per_unit is not known, and taken as 1 V"
@@ -562,8 +562,8 @@ def _levels(run: SimulationResult, pascal: Any) -> SoundLevels:
     )
 
 
-def _figures(run: SimulationResult, limits: Limits, fs: float) -> dict[str, Any]:
-    """Return the figures of merit of a run; with several channels also of each microphone."""
+def _figures(run: SimulationResult, limits: Limits, fs: float, settings: Settings) -> dict[str, Any]:
+    """Return the figures of merit of a run and its settings; with several channels also of each microphone."""
     power = output_power(run.control_signal)
     figures = {
         "noise_reduction_db": noise_reduction_db(run.error, run.disturbance),
@@ -573,6 +573,7 @@ def _figures(run: SimulationResult, limits: Limits, fs: float) -> dict[str, Any]
         "peak_control_signal": peak_control_signal(run.control_signal, steady=1.0),
         "convergence_time_s": convergence_time_s(run.error, run.disturbance, fs, window_s=NSE_WINDOW_S),
         "diverged_at_s": run.diverged_at_s,
+        "settings": {key: float(settings[key]) for key in settings if key in CHOSEN},
     }
     if run.error.ndim == 1:
         return figures

@@ -27,6 +27,11 @@ FORGOTTEN = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)  # 1 - lambda: memories of 10^6
 RIDGE = 0.01  # of FxNLMS, over the energy in the delay line: it is for the start
 DIRECT = ("KF-OPC", "KF-ANC")  # a sample takes K (J I L)^2 operations
 ONE_CHANNEL = ("FxRLS",)
+# The settings that are suggested or tried; the others follow from the rating and the path.
+CHOSEN = (
+    *("step_size", "output_step_size", "regularization", "forgetting"),
+    *("state_noise", "measurement_noise", "initial_variance"),
+)
 
 Settings = dict[str, Any]
 

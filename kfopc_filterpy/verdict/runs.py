@@ -61,6 +61,7 @@ class Plan:
     bar: Any
     feedback: bool = False  # the last references are then what an exact internal model gives
     lock: Any = field(default_factory=threading.Lock)
+    chosen: dict[str, Settings] = field(default_factory=dict)  # with which each algorithm ran at the whole rating
 
     def outcomes(self, names: list[str]) -> list[SimulationResult | AllDivergedError]:
         """Return the run of each algorithm, or why there is none; the first one is behind a limiter."""
@@ -89,8 +90,10 @@ class Plan:
     def run(self, name: str, *, limited: bool, share: float = 1.0) -> SimulationResult:
         """Run an algorithm with its best setting, behind a limiter or not, with a share of the rating's power."""
         limits = scaled(self.limits, share)
-        limiter = limits.limiter(self.fs) if limited else None
-        controller = self.controller(name, self.best(name, limits), limiter=limiter)
+        limiter, best = limits.limiter(self.fs) if limited else None, self.best(name, limits)
+        if share == 1.0:
+            self.chosen[name] = best
+        controller = self.controller(name, best, limiter=limiter)
         heard: Any = self.x
         if self.feedback:
             controller = with_internal_model(controller)

@@ -236,7 +236,7 @@ def _tables(verdict: Assessment) -> Any:
 
 
 def algorithms_table(verdict: Assessment) -> Table:
-    """Return the figures of merit of each run."""
+    """Return the figures of merit of each run, and its settings."""
     volts = verdict.volts_per_unit
     columns = [
         ("Noise reduction (dB)", "noise_reduction_db", None),
@@ -244,12 +244,15 @@ def algorithms_table(verdict: Assessment) -> Table:
         ("Power / rated power", "of_rated_power", None),
         ("Worst window", "worst_window", None),
         ("Highest peak" if volts is None else "Highest peak (V)", "peak_control_signal", volts),
+        ("Converged (s)", "convergence_time_s", None),
     ]
     rows: list[list[str | float]] = []
     for name, own in verdict.figures.items():
         label = name if name == verdict.algorithm else f"{name}, as published"
-        rows.append([label, *(_number(own[key], scale) for _, key, scale in columns)])
-    return Table("algorithms", "The controllers", ["Controller", *(heading for heading, *_ in columns)], rows)
+        settings = ", ".join(f"{key}={value:.6g}" for key, value in own["settings"].items())
+        rows.append([label, *(_number(own[key], scale) for _, key, scale in columns), settings])
+    headings = ["Controller", *(heading for heading, *_ in columns), "Settings"]
+    return Table("algorithms", "The controllers", headings, rows)
 
 
 def _number(value: Any, scale: Any = None) -> Any:

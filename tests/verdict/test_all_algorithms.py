@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kfopc_filterpy import FxLMS, nse_db, simulate
+from kfopc_filterpy import FxLMS, FxNLMS, noise_reduction_db, nse_db, simulate
 from kfopc_filterpy.controllers.table import CORE
 from kfopc_filterpy.signals import band_limited_noise
 from kfopc_filterpy.verdict import assess
 from kfopc_filterpy.verdict.candidates import CANDIDATES, ONE_CHANNEL
 from kfopc_filterpy.verdict.runs import Plan
+from kfopc_filterpy.verdict.verdict_page import algorithms_table
 
 FS, TAPS = 8000, 16
 NOISE = band_limited_noise((100, 1500), 3.0, fs=FS, rng=1, power=1.0)
@@ -45,6 +46,18 @@ def test_the_step_that_runs_is_the_best_on_the_start_of_the_record(verdict):
         return np.inf if run.diverged_at_s else float(np.nanmean(nse_db(run.error, run.disturbance, FS, 0.1)))
 
     assert mean_nse(step) == min(mean_nse(factor * step) for factor in (0.5, 1.0, 2.0))
+
+
+def test_the_settings_that_ran_are_told(verdict):
+    """The run again, from what the figures say."""
+    assert verdict.figures["KF-PB"]["settings"] == {}  # nothing to choose
+    settings = verdict.figures["FxNLMS"]["settings"]
+    d = np.convolve(NOISE, PRIMARY)[: NOISE.size]
+    own = FxNLMS(TAPS, SECONDARY, **settings)
+    again = simulate(own, NOISE - NOISE.mean(), disturbance=d, secondary_path=SECONDARY, fs=FS, switch_on_s=0.3)
+    reached = noise_reduction_db(again.error, again.disturbance)
+    assert verdict.figures["FxNLMS"]["noise_reduction_db"] == pytest.approx(reached, abs=0.01)  # offsets are subtracted
+    assert f"step_size={settings['step_size']:.6g}, regularization=" in "\n".join(algorithms_table(verdict).lines)
 
 
 def test_with_several_channels_those_of_one_channel_and_the_slow_ones_are_left_out():
