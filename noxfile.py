@@ -108,9 +108,8 @@ def tests(session: nox.Session) -> None:
 
 @nox.session(venv_backend="none", allow_parallel=True)
 def studies(session: nox.Session) -> None:
-    """Run README's command for the paper's studies, and compare the figures that the documentation quotes."""
+    """Run README's command for the paper's studies."""
     run_readme(session, "comparisons", "studies/report.html", TQDM_MININTERVAL="20")  # seconds, for a short log
-    session.run(".venv/bin/python", "docs/quoted.py", "studies")
 
 
 @nox.session(venv_backend="none")

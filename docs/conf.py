@@ -83,7 +83,7 @@ html_theme_options = {"sidebar_hide_name": False, "navigation_with_keys": True}
 
 def spread_notebooks(app, env, docnames):
     """Spread the executed pages over the list, because Sphinx gives each process a stretch of it."""
-    executed = [name for name in docnames if name.startswith("tutorials/") or name in ("theory", "limits")]
+    executed = [name for name in docnames if name.startswith("tutorials/") or name == "theory"]
     others = [name for name in docnames if name not in executed]
     step = -(-len(others) // max(len(executed), 1))
     docnames[:] = [name for k, page in enumerate(executed) for name in (page, *others[k * step : (k + 1) * step])]

@@ -22,7 +22,6 @@ import public_names  # noqa: E402
 import source_lines  # noqa: E402
 
 PAGES = sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts)
-TUTORIALS = sorted(page for page in (DOCS / "tutorials").glob("*.md") if page.stem != "index")
 LINE_ROLE = re.compile(r"\{line\}`([^`]+)`")
 PUBLIC = [(name, public_names.thing_of(name)) for name in public_names.public_names()]
 NAMES = [name for name, _ in PUBLIC]
@@ -189,22 +188,6 @@ def test_an_example_in_a_docstring_is_no_wider_than_its_box():
             for example in doctest.DocTestParser().get_examples(doc or ""):
                 lines = [f">>> {line}" for line in example.source.splitlines()] + example.want.splitlines()
                 assert not [line for line in lines if len(line) > room], name
-
-
-# Tutorials.
-
-
-@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
-def test_every_tutorial_is_a_notebook_to_download_with_nothing_hidden(page):
-    """What it says of its figures is checked by a test of its own, so that the notebook runs on other files too."""
-    text = text_of(page)
-    assert "format_name: myst" in text
-    assert f"{{nb-download}}`{page.stem}.ipynb`" in text
-    assert not re.search(r":tags:.*(remove|hide)|^ *assert ", text, re.M), (
-        "a cell that its reader does not see, or an assertion"
-    )
-    assert (Path(__file__).parent / f"test_page_{page.stem}.py").exists(), "no test checks what it says"
-    assert f"\n{page.stem}\n" in text_of(DOCS / "tutorials" / "index.md")
 
 
 # Figures of the pages.
