@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from importlib.metadata import version
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -124,19 +123,6 @@ def _adafilt_rls(
     return FilteredX(n_taps, path, lambda row, d: rls.adapt(row[0], d - rls.w @ row), lambda: rls.w)
 
 
-def _aspsim_nlms(n_taps: int, path: np.ndarray, *, step_size: float, regularization: float) -> FilteredX:
-    from aspcore.adaptivefilter import LMS
-
-    lms = LMS(n_taps, 1, 1, step_size, regularization)
-    one = (1, 1)
-    return FilteredX(
-        n_taps,
-        path,
-        lambda row, d: lms.update(np.full(one, row[0]), np.full(one, d)),
-        lambda: lms.ir[0, 0],
-    )
-
-
 class AdafiltBlocks(PlaysBlocks):
     """adafilt's `MultiChannelBlockLMS`, which is filtered-x LMS in blocks for any number of channels."""
 
@@ -202,7 +188,7 @@ def own_entries() -> dict[str, Algorithm]:
 
 
 def peers() -> dict[str, Algorithm]:
-    """Return the entries of the other packages that are installed, named by package, version and filter."""
+    """Return the entries of the other packages, named by package, version and filter."""
     own = algorithms()
     nlms, rls, kalman = (
         replace(own[name], first=grid, knows_amplifier=False, shares_gains=False, several_channels=False)
@@ -222,9 +208,8 @@ def peers() -> dict[str, Algorithm]:
         ("adafilt", "NLMS"): replace(nlms, make=_adafilt_nlms),
         ("adafilt", "RLS"): replace(kalman, make=_adafilt_rls),
         ("adafilt", "block FxLMS"): blocks,
-        ("aspsim", "NLMS"): replace(nlms, make=_aspsim_nlms),
     }
-    return {f"{package} {version(package)} {name}": own for (package, name), own in made.items() if find_spec(package)}
+    return {f"{package} {version(package)} {name}": own for (package, name), own in made.items()}
 
 
 def entries_for(task: Task, further: Mapping[str, Algorithm | str]) -> dict[str, Algorithm | str]:

@@ -135,7 +135,6 @@ SAMPLES: dict[str, Callable[[int], Work]] = {
     "padasip RLS": padasip,
     "pyroomacoustics RLS": pyroomacoustics,
 }
-NEEDS = {"padasip RLS": "padasip", "pyroomacoustics RLS": "pyroomacoustics"}
 
 # ---- Blocks, as a real-time process hands them over
 

@@ -135,13 +135,10 @@ def test_the_figures_of_a_made_up_run(short: Task) -> None:
         ("padasip RLS", "FxRLS", 1e-3),  # P ages otherwise in the silence before the first block
         ("pyroomacoustics RLS", "padasip RLS", 1e-6),
         ("padasip NLMS", "adafilt NLMS", 1e-9),
-        ("aspsim NLMS", "adafilt NLMS", 1e-9),
     ],
 )
 def test_filters_that_are_one_algorithm_agree(short: Task, theirs: str, same: str, tolerance: float) -> None:
     """In the modified structure and at one setting, over 2000 steps in forms that round differently."""
-    for name in ("padasip", "adafilt", "aspsim"):
-        pytest.importorskip(name)
     found = {re.sub(r" \S+", "", name, count=1): own for name, own in peers().items()}  # without the version
     setting = 1e-4 if "RLS" in theirs else 0.25
     with registered(found):
