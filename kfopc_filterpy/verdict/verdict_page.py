@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, __version__
+from kfopc_filterpy import __version__
 from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
 from kfopc_filterpy.plot.style import new_axes
@@ -41,7 +41,7 @@ def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Pat
     """Write the page, the figures, the sounds and verdict.json into a folder; return the path of the page."""
     path, volts = Path(folder), verdict.volts_per_unit
     figures, tables = list(_figures(verdict)), list(_tables(verdict))
-    sounds = list(run_sounds(verdict.runs, verdict.algorithm))
+    sounds = list(_sounds(verdict))
     write_files(path, NAME, fs=verdict.fs, figures=figures, sounds=sounds, tables=tables)
     write_whole(path / "verdict.json", verdict.json + "\n")
     origin = {
@@ -73,32 +73,19 @@ def _figures(verdict: Assessment) -> Iterator[FigureItem]:
     if np.all(np.isfinite(verdict.least_rated_power)):
         caption += f" Least: the least with which {verdict.algorithm}, which adapts, reaches what is wanted."
     yield FigureItem("bound", caption, _bound(verdict).figure)
-    yield from run_figures(
-        verdict.runs,
-        verdict.limits.rated_power,
-        verdict.watt_per_power,
-        verdict.switch_on_s,
-        together="" if verdict.channels is None else " All microphones together.",
-        pascal_per_unit=verdict.pascal_per_unit,
-    )
+    yield from _run_figures(verdict)
     if verdict.levels is not None:
         n_microphones = len(np.atleast_2d(verdict.levels.before_db))
         figure = _one_below_another(n_microphones, "Microphone", (9, 3.6), partial(_draw_bands, verdict.levels))
         yield FigureItem("third-octaves", f"Third-octave bands without control and with {verdict.algorithm}.", figure)
 
 
-def run_figures(
-    runs: Mapping[str, SimulationResult],
-    rated_power: Any,
-    watt_per_power: Any,
-    switch_on_s: float,
-    *,
-    together: str = "",
-    pascal_per_unit: Any = None,
-) -> Iterator[FigureItem]:
-    """Yield figures of the error spectra, the error power (caption with `together`) and each loudspeaker's power."""
-    begin = SWITCHED_ON.format(switch_on_s)
-    ax: Any = plot_error_spectra(runs, pascal_per_unit=pascal_per_unit)
+def _run_figures(verdict: Assessment) -> Iterator[FigureItem]:
+    """Yield figures of the error spectra, the error power and each loudspeaker's power."""
+    runs, rated_power, watt_per_power = verdict.runs, verdict.limits.rated_power, verdict.watt_per_power
+    begin = SWITCHED_ON.format(verdict.switch_on_s)
+    together = "" if verdict.channels is None else " All microphones together."
+    ax: Any = plot_error_spectra(runs, pascal_per_unit=verdict.pascal_per_unit)
     caption = f"Spectra without control and of the errors, over the steady half.{together}"
     yield FigureItem("spectra", caption, ax.figure)
     ax = plot_nse(runs)
@@ -186,17 +173,17 @@ def _nominal(centre: float) -> str:
     return f"{digits * 10 ** np.floor(np.log10(centre) + 1e-6):g}"
 
 
-def run_sounds(runs: Mapping[str, SimulationResult], own: str = "") -> Iterator[Sound]:
-    """Yield the sounds at each microphone, without control and of each run; the file of the run `own` is called "after"."""
-    first = next(iter(runs.values()))
+def _sounds(verdict: Assessment) -> Iterator[Sound]:
+    """Yield the sounds at each microphone, without control and of each run; the verdict's own run is called "after"."""
+    first = verdict.runs[verdict.algorithm]
     settled = 0.5 * first.n_samples / first.fs
     for k, disturbance in enumerate(np.atleast_2d(first.disturbance)):
         group, end = "at the error microphone", ""
         if first.disturbance.ndim > 1:
             group, end = f"at microphone {k + 1}", f"-{k + 1}"
         yield Sound(f"before{end}", "Without control", disturbance, group, settled)
-        for name, run in runs.items():
-            stem = "after" if name == own else name.lower().replace(" ", "-")
+        for name, run in verdict.runs.items():
+            stem = "after" if name == verdict.algorithm else name.lower().replace(" ", "-")
             yield Sound(f"{stem}{end}", name, np.atleast_2d(run.error)[k], group, settled)
 
 
