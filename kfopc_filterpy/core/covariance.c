@@ -1,23 +1,20 @@
 #include "covariance.h"
 #include <string.h>
 
-/* Above this ratio of S to q, the downdate cancels so many digits of P that it is computed in twice the precision. This
- * happens in the first samples after a large initial variance. */
-static const real CANCELLATION = 1000;
 /* Both in rounding errors of the largest variance. For an h of energy 1, an h'P h below BLUR is nothing but rounding.
  * From then on, and in float always, the state noise is at least LEAST_NOISE. See `blurred`. */
 static const real BLUR = 16, LEAST_NOISE = 2;
 /* P fades until its largest variance is WIDEST times the usual one along the rows. From then on, state noise of the same size
  * along the rows takes the place of fading, so that the others hardly grow. The usual variance falls by e^FALL at most while a
  * row passes, so that a bad sample does not count, and rises with RELEASE of the fading. It is known when h'P h first exceeds
- * TELLING of q: before, the signal may be so soft that P must grow, up to UNKNOWN times the variance at the start. */
-static const real WIDEST = 1e4, FALL = 4, RELEASE = (real)0.0625, TELLING = (real)1e-4, UNKNOWN = (real)1e20;
+ * TELLING of q: before, the signal may be so soft that P must grow, up to UNKNOWN times the variance at the start: any
+ * further, and the weights would follow the noise of the first samples. */
+static const real WIDEST = 1e4, FALL = 4, RELEASE = (real)0.0625, TELLING = (real)1e-4, UNKNOWN = (real)1e6;
 #ifdef ANC_FLOAT
-static const real ROUNDING = FLT_EPSILON, MOST = 1e36f, CAREFULLY = 1e16f, SPLIT = 4097; /* 2^12 + 1, see two_product */
+static const real ROUNDING = FLT_EPSILON, MOST = 1e36f;
 #else
-static const real ROUNDING = DBL_EPSILON, MOST = 1e300, CAREFULLY = 1e100, SPLIT = 134217729; /* 2^27 + 1 */
+static const real ROUNDING = DBL_EPSILON, MOST = 1e300;
 #endif
-enum { DIRECTION, DIRECTION_LOW, GAIN, GAIN_LOW, CAREFUL };
 
 void layout_covariance(covariance *c, int32_t n, anc_layout *at)
 {
@@ -27,7 +24,7 @@ void layout_covariance(covariance *c, int32_t n, anc_layout *at)
     c->T = reals(at, "triangle", ANC_STATE, 1, c->padded / PARTS, c->padded / PARTS + 1, PARTS * PARTS / 2);
     c->h = reals(at, "row", ANC_SCRATCH, 1, 1, 1, c->padded);
     c->Ph = reals(at, "P_row", ANC_SCRATCH, 1, 1, 1, c->padded);
-    c->careful = reals(at, "careful", ANC_SCRATCH, 1, 1, CAREFUL, c->padded);
+    c->lifting = reals(at, "lifting", ANC_SCRATCH, 1, 1, 2, c->padded);
 }
 
 void start_covariance(covariance *c, real initial_variance)
@@ -133,7 +130,7 @@ static void multiply(const covariance *c, const real *x, real *g)
  * lesser one of [a, b; b, d], which is P in the plane of h and P h. */
 static real lift(covariance *c, real variance, real least)
 {
-    real *x = c->careful, *Px = c->careful + c->padded;
+    real *x = c->lifting, *Px = c->lifting + c->padded;
     const real energy = dot(c->h, c->h, c->n), a = variance / energy;
     if (!(energy > 0)) return 0; /* too small to carry information */
     for (int32_t i = 0; i < c->padded; i++) x[i] = c->Ph[i] - a * c->h[i];
@@ -180,113 +177,14 @@ real project(covariance *c, real q)
     return variance < blur * owed->bound ? blurred(c, variance, blur, q) : variance;
 }
 
-/* Numbers in twice the precision, as a rounded value and the rest. */
-
-/* Return a + b; the rounding error goes to `rest` (Knuth). */
-static vector two_sum(vector a, vector b, vector *rest)
-{
-    const vector sum = a + b, b_in_sum = sum - a;
-    *rest = (a - (sum - b_in_sum)) + (b - b_in_sum);
-    return sum;
-}
-
-/* Return a b; the rounding error goes to `rest` (Dekker). */
-static vector two_product(vector a, vector b, vector *rest)
-{
-    const vector product = a * b, cut_a = SPLIT * a, cut_b = SPLIT * b;
-    const vector a_high = cut_a - (cut_a - a), b_high = cut_b - (cut_b - b), a_low = a - a_high, b_low = b - b_high;
-    *rest = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low;
-    return product;
-}
-
-/* Add a b to (sum, low) (Dot2 of Ogita, Rump and Oishi). */
-static void add_product(vector *sum, vector *low, vector a, vector b)
-{
-    vector product_rest, sum_rest;
-    const vector product = two_product(a, b, &product_rest);
-    *sum = two_sum(*sum, product, &sum_rest);
-    *low += product_rest + sum_rest;
-}
-
-/* Return the sum of partial sums; what is below its last digit goes to `rest`. */
-static real total_with_rest(const vector sum[VECTORS], const vector low[VECTORS], real *rest)
-{
-    real part[PARTS], part_low[PARTS], result[PARTS], result_low[PARTS];
-    for (int v = 0; v < VECTORS; v++) vectors_of(part)[v] = sum[v], vectors_of(part_low)[v] = low[v];
-    vector all = zero + part[0], all_low = zero + part_low[0], error;
-    for (int p = 1; p < PARTS; p++) all = two_sum(all, zero + part[p], &error), all_low += error + part_low[p];
-    all = two_sum(all, all_low, &error);
-    *vectors_of(result) = all, *vectors_of(result_low) = error;
-    *rest = result_low[0];
-    return result[0];
-}
-
-/* Set g + g_low to T h. */
-static void multiply_carefully(const covariance *c, real *g, real *g_low)
-{
-    const real *a = c->T, *h = c->h;
-    memset(g, 0, sizeof(real) * (size_t)c->padded), memset(g_low, 0, sizeof(real) * (size_t)c->padded);
-    for (int32_t i = 0; i < c->padded; i++) {
-        const int32_t group = i / PARTS * PARTS, length = group + PARTS;
-        vector sum[VECTORS], low[VECTORS];
-        for (int v = 0; v < VECTORS; v++) sum[v] = low[v] = zero;
-        for (int32_t j = 0; j < length; j += PARTS)
-            for (int v = 0; v < VECTORS; v++) {
-                add_product(sum + v, low + v, vectors(a + j)[v], vectors(h + j)[v]);
-                if (j < group) add_product(vectors_of(g + j) + v, vectors_of(g_low + j) + v, vectors(a + j)[v], zero + h[i]);
-            }
-        g[i] = total_with_rest(sum, low, g_low + i);
-        a += length;
-    }
-}
-
-/* Apply eq. 8 in twice the precision and return 1 / sqrt(S), or 0, with nothing changed, if a number is too large. */
-static real downdate_carefully(covariance *c, real q)
-{
-    real *g = c->careful + times(DIRECTION, c->padded), *g_low = c->careful + times(DIRECTION_LOW, c->padded);
-    real *k = c->careful + times(GAIN, c->padded), *k_low = c->careful + times(GAIN_LOW, c->padded), *a = c->T;
-    const real noise[PARTS] = {q};
-    vector sum[VECTORS], low[VECTORS], rest;
-    multiply_carefully(c, g, g_low);
-    for (int v = 0; v < VECTORS; v++) sum[v] = vectors(noise)[v], low[v] = zero;
-    for (int32_t j = 0; j < c->padded; j += PARTS)
-        for (int v = 0; v < VECTORS; v++) {
-            add_product(sum + v, low + v, vectors(c->h + j)[v], vectors(g + j)[v]);
-            low[v] += vectors(c->h + j)[v] * vectors(g_low + j)[v];
-        }
-    real S_low;
-    const real S = total_with_rest(sum, low, &S_low);
-    for (int32_t j = 0; j < c->padded; j += WIDE) { /* K = g / S */
-        const vector gain = *vectors(g + j) / S, product = two_product(gain, zero + S, &rest);
-        *vectors_of(k + j) = gain;
-        *vectors_of(k_low + j) = (((*vectors(g + j) - product) - rest) + *vectors(g_low + j) - gain * S_low) / S;
-    }
-    for (int32_t i = 0; i < c->n; i++)
-        if (!(S > 0 && S < CAREFULLY && within(g[i], CAREFULLY) && within(k[i], CAREFULLY) && within(k_low[i], CAREFULLY))) return 0;
-    for (int32_t i = 0; i < c->padded; i++) {
-        const int32_t group = i / PARTS * PARTS, length = group + PARTS;
-        for (int32_t j = 0; j < length; j += WIDE) {
-            const vector product = two_product(zero + g[i], *vectors(k + j), &rest);
-            *vectors_of(a + j) = (*vectors(a + j) - product) - (rest + (g[i] * *vectors(k_low + j) + g_low[i] * *vectors(k + j)));
-        }
-        for (int32_t j = group; j < i; j++) row_of(c, j)[i] = a[j]; /* both halves of a group stay equal */
-        a += length;
-    }
-    const real inverse_root = 1 / root(S);
-    for (int32_t j = 0; j < c->padded; j++) c->u[j] = g[j] * inverse_root;
-    return inverse_root;
-}
-
 int tells(const covariance *c, real S) { return S > 0 && root(c->owed->bound) <= LARGEST * root(S); }
 
-real downdate(covariance *c, real S, real q)
+real downdate(covariance *c, real S)
 {
-    real inverse_root = S > CANCELLATION * q ? downdate_carefully(c, q) : 0;
-    if (inverse_root > 0) return inverse_root;
     real *restrict u = c->u;
     const real *restrict Ph = c->Ph;
     const int32_t n = c->padded;
-    inverse_root = 1 / root(S);
+    const real inverse_root = 1 / root(S);
     for (int32_t j = 0; j < n; j++) u[j] = Ph[j] * inverse_root;
     c->owed->pending = 1;
     return inverse_root;
@@ -341,20 +239,7 @@ int anc_covariance_update(void *memory, int32_t n, anc_real *w, const anc_real *
     result[0] = y, result[1] = S;
     if (!(S > 0)) return ANC_NO_SOLUTION;
     if (!within(root(c.owed->bound) * (y / root(S)), MOST)) return ANC_LOUD_STEP;
-    const real inverse_root = downdate(&c, S, q);
+    const real inverse_root = downdate(&c, S);
     correct(&c, w, y, inverse_root, MOST);
-    return ANC_DONE;
-}
-
-int anc_covariance_step(void *memory, int32_t n, anc_real *w, const anc_real *h, anc_real z, anc_real r, anc_real q, anc_real fading, anc_real result[2])
-{
-    covariance c = in_memory(memory, n);
-    if (!predictable(&c, fading, r, dot(h, h, n))) return ANC_NO_SOLUTION;
-    predict(&c, fading, r);
-    memcpy(c.h, h, sizeof(real) * (size_t)n);
-    const real S = project(&c, q) + q, y = z - dot(h, w, n);
-    if (tells(&c, S)) correct(&c, w, y, downdate(&c, S, q), LARGEST);
-    else memset(c.u, 0, sizeof(real) * (size_t)c.padded); /* P is what it was predicted to be */
-    result[0] = y, result[1] = S;
     return ANC_DONE;
 }

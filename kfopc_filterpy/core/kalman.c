@@ -48,7 +48,7 @@ static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
     observe(f, rows, k);
     const real S = project(&f->c, q) + q; /* eq. 7 */
     const int tell = tells(&f->c, S);
-    const real inverse_root = tell ? downdate(&f->c, S, q) : 0;
+    const real inverse_root = tell ? downdate(&f->c, S) : 0;
     for (int32_t scenario = 0; scenario < f->s.S; scenario++) {
         real *w = weights_of(&f->s, scenario * f->s.J);
         const real y = (z ? z[scenario * K + k] : 0) - dot(f->c.h, w, f->c.n);

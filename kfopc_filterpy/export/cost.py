@@ -6,6 +6,7 @@ import numpy as np
 
 from ..core.block import Block
 from ..core.run_loop import SOFT_SATURATION
+from ..core.triangle import GROUP
 
 OF_POWERS, OF_LIMITER, OF_SOFT_AMPLIFIER = 12, 43, 150  # multiplications for each loudspeaker
 # Multiplications per weight, beyond those of y: of the diagonal filter for each row of x' that a sample learns from, or in all.
@@ -26,6 +27,8 @@ def operations(block: Block) -> str:
     rows = K * (1 + guarded)
     if algorithm == "kalman":
         learning = rows * (3 * n * n // 2 + 12 * n)
+        if block.fields["fading"].item() > 1:
+            learning += n * (n + GROUP)  # `fade` in covariance.c
     elif algorithm == "diagonal":
         learning = rows * n * OF_DIAGONAL
     else:
@@ -43,11 +46,6 @@ def worst(block: Block) -> str:
     parts = ["one that moves the samples of the delay lines"]
     if windows:
         parts.append(f"every {max(windows):,}th, in which the limiter adds up its window")
-    if algorithm == "kalman":
-        parts.append(
-            "one whose innovation variance exceeds 1000 times the measurement noise, mostly soon after the start, which "
-            "updates P in twice the precision"
-        )
     if algorithm == "power_budget":
         parts.append("by far the last one of a block, which does the work of the whole block")
     return "; ".join(parts) + "."

