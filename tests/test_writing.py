@@ -41,7 +41,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "error.wav": lambda folder: write_wav(folder / "error.wav", np.ones(500), FS),
     "figure.svg": lambda folder: save_figure(Figure(), folder / "figure"),
     "anc.c": lambda folder: export_c(FxLMS(8, [1.0], step_size=0.1), folder / "anc.c"),
-    "run.kfopc": lambda folder: FxLMS(500, [1.0], step_size=0.1).save(folder / "run.kfopc"),
+    "run.npz": lambda folder: FxLMS(500, [1.0], step_size=0.1).save(folder / "run.npz"),
     "report.html": lambda folder: write_report([report()], folder),
 }
 

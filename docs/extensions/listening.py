@@ -69,7 +69,7 @@ def scene() -> dict[str, Any]:
         of_budget = settings_of(kf_pb(TAPS, secondary, rated_power=1.0, fs=fs))
         constrained = kf_opc(TAPS, secondary, constraint=OutputPowerConstraint(1.0, fs=fs), **NOISES)
         rates[int(fs)] = {name: of_budget[name] for name in ("block", "averaging", "window")}
-        rates[int(fs)]["rate"] = float(constrained._opened().fields["constraint"].ravel()[1])
+        rates[int(fs)]["rate"] = float(constrained._block.fields["constraint"].ravel()[1])
     return {
         "fs": FS,
         "noise": base64.b64encode(integers.tobytes()).decode(),
@@ -83,7 +83,7 @@ def scene() -> dict[str, Any]:
 
 def settings_of(controller: Any) -> dict[str, float]:
     """Return the settings of a controller as the core takes them, in its order."""
-    block = controller._opened()
+    block = controller._block
     return {name: float(block.fields[name].ravel()[0]) for name, _ in block.algorithm.settings}
 
 

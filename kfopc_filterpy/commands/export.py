@@ -16,7 +16,7 @@ from .options import DONE, Parser, add_command, add_reading
 
 EXAMPLES = """examples:
   kfopc export controller.toml -o firmware --dtype float32
-  kfopc export trained.kfopc -o firmware --name left
+  kfopc export trained.npz -o firmware --name left
   kfopc export controller.toml -o simulation --fmu
 
 controller.toml, where every other key is a keyword argument of the algorithm in Python:
@@ -30,7 +30,7 @@ controller.toml, where every other key is a keyword argument of the algorithm in
   [limiter]                    # OutputLimiter; [[limiter]] once for each of several loudspeakers
   rated_power = 0.5
   # likewise [constraint], [secondary_path_uncertainty] (PathTolerance) and [amplifier] (limit, sharpness)
-trained.kfopc is what controller.save wrote: the export goes on from its state"""
+trained.npz is what controller.save wrote: the export goes on from its state"""
 
 
 def add_to(commands: argparse._SubParsersAction[Parser]) -> None:

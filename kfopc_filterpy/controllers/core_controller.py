@@ -48,7 +48,7 @@ class setting:
         if not self.assignable:
             raise AttributeError(f"{self.name} cannot be assigned: make a new controller")
         with controller.in_use:
-            controller._opened().fields[self.name][:] = controller._checked_setting(self.name, value)
+            controller._block.fields[self.name][:] = controller._checked_setting(self.name, value)
 
 
 class CoreController(Channels, BlockProcessing, Checkpointed):
@@ -122,7 +122,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     needs_rated_power: ClassVar[bool] = False  # or a constraint
     takes_guard: ClassVar[bool] = True  # whether the step takes account of an uncertain secondary path
     internal_model: bool = False
-    _block: Block | None = None
+    _block: Block
     _uncertainty: Any = None  # as it was assigned
 
     def __init__(
@@ -163,11 +163,11 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
     def _number_of_each(self, name: str) -> Any:
         """Return a field of the core that has a number for each channel."""
-        return self._shaped(self._opened().fields[name].ravel())
+        return self._shaped(self._block.fields[name].ravel())
 
     def _by_channel(self, name: str) -> np.ndarray:
         """Return a field of filters, (outputs, inputs, taps) or (taps,), in the core's memory."""
-        filters = self._opened().fields[name][0]
+        filters = self._block.fields[name][0]
         return filters if self.multichannel else filters[0, 0]
 
     # Checks of what the user gives.
@@ -246,7 +246,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
     def _remake_block(self) -> None:
         """Go on in a block for the limiter and the internal model that are now in use."""
-        block = self._opened()
+        block = self._block
         guard = block.fields["guard"].ravel()
         shape = self._needed_shape(block.shape.path_taps, guard.size)
         self._use_block(block.remade(shape, guard if guard.size else None))
@@ -265,7 +265,6 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
     def _use_block(self, block: Block) -> None:
         """Go on in a block, into which the constraints and limiters move."""
-        self._memory, self._shape = block.memory, block.shape
         fields = block.fields
         for j, constraint in enumerate(self._each(self._own_constraint)):
             window = _rows(fields["power_window"][0, j], block.shape.power_windows[j])
@@ -274,26 +273,19 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
             limiter.live_in(fields["limiter"][0, 0, j], _rows(fields["laps"][0, j], block.shape.limiter_windows[j] + 1))
         self._block = block
 
-    def _opened(self) -> Block:
-        """Return the block; that of a copy, or of a controller from a file, is opened when it is first used."""
-        if self._block is None:
-            self._use_block(Block(self._algorithm(), self._shape, memory=self._memory))
-        return self._block  # type: ignore[return-value]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes for a copy or a file: the memory and the shape stand for the block."""
-        with self.in_use:
-            memory = self._opened().saved()
-            return {name: value for name, value in vars(self).items() if name != "_block"} | {"_memory": memory}
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go on as a copy, with a block of its own; the constraints and limiters move into it."""
+        vars(self).update(state)
+        self._use_block(self._block)
 
     @property
     def in_use(self) -> InUse:
         """Context that refuses to be entered by a second thread: RuntimeError."""
-        return self._opened().in_use
+        return self._block.in_use
 
     def _of_setting(self, name: str) -> Any:
         """Return a setting: a number, or with several channels (J,) or (K,) where each has its own."""
-        values = self._opened().fields[name].ravel()
+        values = self._block.fields[name].ravel()
         return values.copy() if self._who_has(name) else float(values[0])
 
     # Assignments.
@@ -305,12 +297,11 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         With several channels it is a tuple, one for each loudspeaker. The disturbance is estimated from the output of
         the limiter, so the adaptation stays correct.
         """
-        self._opened()
         return self._limiter
 
     @limiter.setter
     def limiter(self, value: Limiters) -> None:
-        block = self._opened()
+        block = self._block
         with block.in_use:
             before, self._limiter = self._limiter, self._checked_limiter(value)
             for limiter in self._each(before):
@@ -346,7 +337,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
     def _filter_again(self) -> None:
         """Filter the stored references with the present estimate, and the results with the guard."""
-        self._opened().refilter()
+        self._block.refilter()
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Adapt what the algorithm knows to the new estimate; `before` is the last one, of the same shape."""
@@ -380,7 +371,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         taps = guard_filter(value, self._estimated_path())
         with self.in_use:
             self._uncertainty = as_uncertainty(value)
-            self._use_block(self._opened().with_guard(taps))
+            self._use_block(self._block.with_guard(taps))
 
     @property
     def rated_power(self) -> NumberOrArray | None:
@@ -429,7 +420,6 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
         With several channels it is a tuple, one for each loudspeaker.
         """
-        self._opened()
         return self._own_constraint
 
     @property
@@ -479,7 +469,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
         With several channels, x(n) is (I,) and y(n) is (J,). A feedback controller has no reference microphone: None.
         """
-        block, x = self._opened(), self._sample(reference, "reference", "references")
+        block, x = self._block, self._sample(reference, "reference", "references")
         block.enter()
         try:
             block.reference[:] = x
@@ -499,7 +489,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
     def _take(self, error: Any, step: str) -> None:
         """Hand an error to a step of the core, "update" or "take_error"."""
-        block, e = self._opened(), self._sample(error, "error", "microphones")
+        block, e = self._block, self._sample(error, "error", "microphones")
         block.enter()
         try:
             block.error[:] = e
@@ -559,7 +549,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
             raise refused_while_listening(OVERFLOW, taken)
 
     def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
-        block = self._opened()
+        block = self._block
         x, e = (signal.reshape(len(signal), -1) for signal in (references, errors))
         for begin in range(0, len(x), LONGEST_CALL):
             part = slice(begin, begin + LONGEST_CALL)
@@ -572,7 +562,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         """Return what the core's loop needs to run this controller; None if Python must call the steps."""
         if calls_of(type(self)) != calls_of(CoreController):
             return None
-        block = self._opened()
+        block = self._block
         constraint = block.fields["constraint"][0, 0].view(NUMBERS)[:, 0]
         return Looped(
             Steps(block.address, *block.algorithm.steps),

@@ -121,4 +121,4 @@ class DiagonalKalman(CoreController):
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Let the variances grow by that which the new path gives to the weights."""
-        self._opened().fields["variances"][:] += self._variance_by_new_path(before)
+        self._block.fields["variances"][:] += self._variance_by_new_path(before)

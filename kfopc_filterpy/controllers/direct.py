@@ -151,11 +151,11 @@ class DirectKalman(CoreController):
     @property
     def covariance(self) -> np.ndarray:
         """State covariance P, (J I L, J I L), in the order of ``weights.ravel()``; a new array."""
-        fields = {name: self._opened().fields[name].ravel() for name in ("owed", "triangle", "gain_direction")}
+        fields = {name: self._block.fields[name].ravel() for name in ("owed", "triangle", "gain_direction")}
         scale, diagonal, pending, *_ = fields["owed"].view(OWED).item()
         direction = fields["gain_direction"][: self._by_channel("weights").size]
         return full_covariance(fields["triangle"], direction, scale, diagonal, -scale * pending)
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Let P grow by the variance that the new paths give to the weights."""
-        self._opened().fields["owed"].ravel().view(OWED)["diagonal"] += self._variance_by_new_path(before)
+        self._block.fields["owed"].ravel().view(OWED)["diagonal"] += self._variance_by_new_path(before)

@@ -133,7 +133,7 @@ class KalmanController(CoreController):
     def update(self, error: float) -> None:
         """Let the estimator predict and update (eq. 2-9) with the error e(n) that the last control signal left."""
         super().update(error)
-        block, estimator = self._opened(), self.estimator
+        block, estimator = self._block, self.estimator
         d, x = float(block.fields["disturbance"].item()), float(block.latest("reference").flat[0])
         h, powers = block.latest("filtered_reference").reshape(1, -1)[:, : self.n_taps].copy(), self.constraint
         undo = undoing(estimator)
@@ -166,7 +166,7 @@ class KalmanController(CoreController):
     def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
         if self.constraint is self._own_constraint:
             return super()._listen(references, errors, adapting)
-        block = self._opened()
+        block = self._block
         for n, e in enumerate(errors):
             taken = super()._listen(references[n : n + 1], errors[n : n + 1], adapting[n : n + 1])
             if not taken:

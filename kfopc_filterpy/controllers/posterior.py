@@ -43,7 +43,7 @@ class PosteriorController(CoreController):
     @property
     def alarms(self) -> int:
         """Number of times so far that the errors contradicted the paths."""
-        return int(self._opened().fields["alarms"].item())
+        return int(self._block.fields["alarms"].item())
 
     @property
     def primary_path(self) -> np.ndarray:
@@ -67,7 +67,7 @@ class PosteriorController(CoreController):
 
     def _means(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the posterior means as the core has them, (K, I, N) and (K, J, M)."""
-        fields = self._opened().fields
+        fields = self._block.fields
         theta, given = fields["theta"].reshape(self.n_microphones, -1), fields["secondary_path"][0]
         learned = given[0].size if fields["spread"].item() > 0.0 else 0  # taps of secondary paths, the last in theta
         n = theta.shape[1] - learned
@@ -76,7 +76,7 @@ class PosteriorController(CoreController):
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Begin the posterior anew around the new path; the control filter, the account and the signals stay."""
-        block = self._opened()
+        block = self._block
         spread = block.fields["spread"]
         if spread.item() > 0.0 and self._uncertainty is not None:  # measured paths: another distance from the new path
             spread[:] = relative_spread(self._uncertainty, self._estimated_path()) or LEAST_SPREAD
@@ -122,4 +122,4 @@ class PathObserver(PosteriorController):
     @property
     def fits(self) -> int:
         """Number of posteriors so far."""
-        return int(self._opened().fields["fits"].item())
+        return int(self._block.fields["fits"].item())

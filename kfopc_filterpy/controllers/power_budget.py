@@ -146,7 +146,7 @@ class PowerBudgetController(PosteriorController):
 
     def _take_rated_power(self, value: Any) -> None:
         """Use another rated power; what was spent before still counts relative to the old one."""
-        self._opened().fields["rated_power"].ravel()[:] = value
+        self._block.fields["rated_power"].ravel()[:] = value
 
     @property
     def _powers_fs(self) -> float:
@@ -162,7 +162,7 @@ class PowerBudgetController(PosteriorController):
         looped = super().looped()
         if looped is None:
             return None
-        return looped._replace(recorded={**looped.recorded, "power_weight": self._opened().fields["price"].ravel()})
+        return looped._replace(recorded={**looped.recorded, "power_weight": self._block.fields["price"].ravel()})
 
 
 def kf_pb(

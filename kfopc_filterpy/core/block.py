@@ -109,9 +109,6 @@ class Algorithm:
         """Return the fields of the block of a plan."""
         return fields_of(self.library.held.anc_describe, self.pointer, ctypes.byref(plan))
 
-    def __reduce__(self) -> Any:
-        return Algorithm, (self.name, self.real)
-
 
 @dataclass(frozen=True)
 class Shape:
@@ -159,7 +156,7 @@ class InUse:
 
 
 class Block:
-    """A controller's memory. A copy of `memory` is a copy of the controller.
+    """A controller's memory. A copy of `memory` is a copy of the controller; `copy.deepcopy` makes one.
 
     Parameters
     ----------
@@ -168,13 +165,11 @@ class Block:
     shape : Shape
         Its size.
     path : ndarray, shape (K, J, M)
-        Estimated secondary paths of a fresh block.
+        Estimated secondary paths.
     settings : mapping of str to float or sequence of J or K
-        Settings of a fresh block, by name.
+        Settings, by name.
     guard : ndarray, shape (G,), optional
-        Filter W of a fresh block with guard_taps.
-    memory : ndarray of uint8, optional
-        Memory of another block of this algorithm and shape, to go on from; a copy is kept.
+        Filter W, with guard_taps.
 
     Attributes
     ----------
@@ -194,33 +189,56 @@ class Block:
         path: NDArray[np.float64] | None = None,
         settings: Mapping[str, Any] | None = None,
         guard: NDArray[np.float64] | None = None,
-        memory: NDArray[np.uint8] | None = None,
     ) -> None:
         self.algorithm, self.shape = algorithm, shape
+        self._open(path, settings, guard)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy, a pickle or a file has: the plan, the settings, the memory, and where its fields are."""
+        with self.in_use:
+            return {
+                "algorithm": self.algorithm.name,
+                "real": self.algorithm.real,
+                "shape": asdict(self.shape),
+                "settings": {name: self.fields[name].ravel().tolist() for name, _ in self.algorithm.settings},
+                "layout": self._layout,
+                "memory": self.saved(),
+            }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go on from what `__getstate__` returned, if the core still lays out the fields like that."""
+        self.algorithm, self.shape = Algorithm(state["algorithm"], state["real"]), Shape(**state["shape"])
+        self._open(None, state["settings"], None, state)
+
+    def _open(self, path: Any, settings: Any, guard: Any, state: Mapping[str, Any] | None = None) -> None:
+        """Open the memory: fresh, or with the layout and the bytes of a state."""
+        algorithm, shape = self.algorithm, self.shape
+        keep = self._plan_arrays(path, settings, guard)
+        self._require_sizes(keep, state is None)
         self.in_use = InUse()
         self.enter, self.leave = self.in_use.enter, self.in_use.leave
         self._library: Any = algorithm.library.held
-        keep = self._plan_arrays(path, settings, guard)
-        self._require_sizes(keep, memory is None)
-        if memory is not None:
-            keep["settings"] = self._settings_in(memory, keep)
         plan = _plan_of(shape, keep)
         described = algorithm.pointer, ctypes.byref(plan)
         size = self._library.anc_size(*described)
         if not size:
             raise ValueError(f"a controller of this size cannot be made: {shape}")
+        layout = algorithm.fields(plan)
+        self._layout = {name: [role, kind, offset, *axes] for name, role, kind, offset, axes in layout}
         self.memory = at_cache_line(size)
-        if memory is not None:
-            if memory.size != size:
-                raise ValueError(f"the memory must have {size} bytes, got {memory.size}")
-            self.memory[:] = memory
+        if state is not None:
+            if state["layout"] != self._layout or state["memory"].shape != (size,):
+                raise ValueError(
+                    f"the core lays out the fields of {algorithm.name} in another way than when it was saved"
+                )
+            self.memory[:] = state["memory"]
         self._view = (ctypes.c_void_p * _VIEW_PLACES)()
         self.address = ctypes.addressof(self._view)
-        if not self._library.anc_open(*described, self._view, self.memory.ctypes.data, size, memory is None):
+        if not self._library.anc_open(*described, self._view, self.memory.ctypes.data, size, state is None):
             raise ValueError(f"a setting or a path of {algorithm.name} is out of its range: {settings}")
         self.fields: dict[str, NDArray[Any]] = {}
         names: dict[int, list[str]] = {_STATE: [], _SETTING: [], _SCRATCH: []}
-        for name, role, kind, offset, axes in algorithm.fields(plan):
+        for name, role, kind, offset, axes in layout:
             dtype = (algorithm.precision, np.dtype(np.int32))[kind]
             self.fields[name] = np.frombuffer(self.memory, dtype, int(np.prod(axes)), offset).reshape(axes)
             names[role].append(name)
@@ -249,16 +267,6 @@ class Block:
             "guard": np.array([] if guard is None else guard, real),
             "settings": np.concatenate([*values, np.zeros(1)]).astype(real) if settings else np.array([]),
         }
-
-    def _settings_in(self, memory: NDArray[np.uint8], arrays: dict[str, np.ndarray]) -> np.ndarray:
-        """Return the settings of a block, on which the size of the fields after them may depend."""
-        real, own = self.algorithm.precision, self.algorithm.settings
-        fields = self.algorithm.fields(_plan_of(self.shape, {**arrays, "settings": np.array([])}))
-        ends = {field.name: (field.offset, field.offset + real.itemsize * field.shape[3]) for field in fields}
-        values = [memory[slice(*ends.get(name, (0, 0)))] for name, _ in own]
-        if sum(value.size for value in values) != real.itemsize * sum(self.shape.count(each) for _, each in own):
-            raise ValueError(f"the memory of {memory.size} bytes is not that of a controller of {self.shape}")
-        return np.concatenate([*(value.view(real) for value in values), np.zeros(1, real)])
 
     def _require_sizes(self, arrays: Mapping[str, np.ndarray], fresh: bool) -> None:
         """Raise ValueError if the core would see another shape, or read beyond an array."""

@@ -175,7 +175,7 @@ def exportable(controller: Any) -> Block:
     elif calls_of(kind) != calls_of(CoreController):
         obstacle = "has calls of its own"
     else:
-        return controller._opened()
+        return controller._block
     named = f"{getattr(controller, 'name', kind.__name__)} ({kind.__name__})"
     raise TypeError(f"{named} {obstacle} and cannot be exported: {EXPORTED}")
 

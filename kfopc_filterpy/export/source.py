@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from string import Template
@@ -165,7 +166,7 @@ class Exported:
 
     def _expected(self) -> NDArray[Any]:
         """Return the last outputs of the self-test."""
-        block = Block(self.block.algorithm, self.block.shape, memory=self.block.memory)
+        block = deepcopy(self.block)
         outputs = np.empty((self._n_samples(), block.shape.loudspeakers), block.algorithm.precision)
         for n, row in enumerate(outputs):
             block.reference[:] = [((7 * n + 3 * i) % 17 - 8) / 8 for i in range(self.n_references)]

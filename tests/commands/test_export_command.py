@@ -108,8 +108,8 @@ def test_a_controller_that_python_saved_goes_on(command, folder, tmp_path):
     simulate(
         controller, np.random.default_rng(0).standard_normal(500), primary_path=[0, 0, 1.0], secondary_path=[0, 1.0]
     )
-    controller.save(folder / "trained.kfopc")
-    code, _, err = command("export", "trained.kfopc", "-o", tmp_path / "out", "--name", "anc")
+    controller.save(folder / "trained.npz")
+    code, _, err = command("export", "trained.npz", "-o", tmp_path / "out", "--name", "anc")
     assert (code, err) == (0, "")
     assert same_as_of_python(controller, tmp_path / "out", tmp_path)
 
@@ -157,10 +157,10 @@ def test_what_is_wrong_in_a_settings_file_is_said_in_one_line(case, command, fol
 
 
 def test_other_wrong_input(command, folder, tmp_path):
-    VerifiedController(FxLMS(8, [0.0, 1.0], step_size=0.01)).save(folder / "wrapped.kfopc")
+    VerifiedController(FxLMS(8, [0.0, 1.0], step_size=0.01)).save(folder / "wrapped.npz")
     (folder / "c.toml").write_text(described(**GOOD))
     for arguments, message in {
-        ("wrapped.kfopc",): r"FxLMS .* \(VerifiedController\) is not in the core and cannot be exported",
+        ("wrapped.npz",): r"FxLMS .* \(VerifiedController\) is not in the core and cannot be exported",
         ("text.wav",): "text.wav",
         ("c.toml", "--name", "main"): "name must not be 'main'",
         ("c.toml", "--fmu"): "an FMU needs the sample rate: give --fs, or fs in the settings file",

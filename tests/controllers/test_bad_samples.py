@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.checkpoints import Room, contents
+from helpers.checkpoints import Room
 from helpers.controllers import ALL
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kfopc_filterpy import KFOPC, FxLMS, FxNLMS, LimitedController, OutputLimiter, fx_rls, simulate
+from kfopc_filterpy.checkpoint import content_of
 from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.signals import band_limited_noise, tone
 
@@ -58,7 +59,7 @@ def test_a_refused_sample_leaves_the_saved_state_as_it_was(name: str, half: str,
         taken_by_users_own = name == "LimitedController" and value in LOUD
         assert taken_by_users_own or not any(value is one for one in UNUSABLE), "it was taken"
         return
-    assert contents(controller) == contents(before)
+    assert content_of(controller) == content_of(before)
     if half == "update":
         room.n += 1  # the run goes on without it
     room.run(controller, 20)
@@ -172,7 +173,7 @@ def test_a_second_thread_is_refused_and_the_first_one_is_unharmed() -> None:
     assert running.is_alive()  # it ran meanwhile
     running.join()
     np.testing.assert_array_equal(answers[0], expected)
-    assert contents(controller) == contents(alone)
+    assert content_of(controller) == content_of(alone)
 
 
 class Patient:

@@ -9,7 +9,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from helpers.checkpoints import contents
 from helpers.controllers import KALMAN, MAKERS, MANY, PATHS, SEVERAL, VARIANTS, K, constraint, made
 from helpers.loop import AMPLIFIERS, FS, MU, N_TAPS, S_HAT, N, S, noises, run
 from scipy.signal import lfilter
@@ -25,6 +24,7 @@ from kfopc_filterpy import (
     simulate_scenarios,
 )
 from kfopc_filterpy.bounds import power_constrained_solution, predictor_reference, wiener_solution
+from kfopc_filterpy.checkpoint import content_of
 from kfopc_filterpy.controllers import (
     FeedbackNeutralizer,
     RefusedUpdate,
@@ -222,12 +222,12 @@ def test_a_refused_error_leaves_the_state_and_one_that_never_comes_counts_as_sil
     controller = with_internal_model(kf_opc(N_TAPS, S_HAT, rated_power=0.3, **KALMAN))
     run_before = simulate(controller, None, disturbance=D, secondary_path=S_HAT)
     played = np.append(run_before.control_signal, controller.control_signal(None))
-    before = contents(controller)
+    before = content_of(controller)
     for bad in (np.nan, np.inf, 1e30, 1e160, "a"):
         for step in (controller.update, controller.take_error):
             with pytest.raises((ValueError, TypeError)):
                 step(bad)
-    assert contents(controller) == before
+    assert content_of(controller) == before
     twin = pickle.loads(pickle.dumps(controller))
     estimate = 0.3 + S_HAT @ past(played, played.size - 1, S_HAT.size)
     twin.take_error(0.3)  # now its reference is d^, and the other's is 0
@@ -271,8 +271,8 @@ def test_what_is_refused(call: Any, message: str) -> None:
 
 def test_the_given_controller_stays_as_it_was() -> None:
     controller = FxLMS(N_TAPS, S_HAT, step_size=MU)
-    before = contents(controller)
+    before = content_of(controller)
     made_from_it = with_internal_model(controller)
-    assert contents(controller) == before
+    assert content_of(controller) == before
     assert (made_from_it.name, made_from_it.n_references, controller.n_references) == ("feedback FxLMS", 0, 1)
     assert run(controller).algorithm == "FxLMS"

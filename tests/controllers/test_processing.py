@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 from helpers.channels import random_paths
-from helpers.checkpoints import contents
 from helpers.controllers import ALL
 from helpers.loop import S_HAT
 from helpers.simulation import X
 
 from kfopc_filterpy import KFOPC, FrequencyDomainFxLMS, FxLMS, KalmanController, kf_anc
+from kfopc_filterpy.checkpoint import content_of
 from kfopc_filterpy.controllers import RefusedUpdate
 
 MADE = ALL | {"two channels": lambda: FxLMS(8, random_paths(2, 2, 6, seed=1), step_size=1e-3, n_references=2)}
@@ -166,8 +166,8 @@ def test_the_interpreter_lock_is_released() -> None:
 @pytest.mark.parametrize("name", ["FxLMS plain", "LimitedController"])
 def test_an_output_that_overlaps_with_the_signals_is_refused_with_nothing_changed(name: str) -> None:
     controller, room = MADE[name](), np.random.default_rng(0).standard_normal(60)
-    before = contents(controller)
+    before = content_of(controller)
     for x, e, out in ((room[:20], room[30:50], room[30:50]), (room[:20], room[30:50], room[10:30])):
         with pytest.raises(ValueError, match="out must not overlap"):
             controller.process(x, e, out=out)
-    assert contents(controller) == before
+    assert content_of(controller) == before

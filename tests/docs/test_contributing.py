@@ -148,7 +148,7 @@ def test_the_algorithm_that_it_adds_to_the_package_runs_and_is_tuned(tmp_path, s
     build = "from building import *; build(core_sources(), FOLDER / library_name('double', LEVELS[0]))"
     subprocess.run([sys.executable, "-c", build], cwd=package / "core", check=True)
     names = f"REGISTERED, STYLED = {REGISTERED.strip()!r}, {STYLED.strip()!r}\n"
-    more = "assert many._opened().fields['mean_error'].shape == (1, 1, 1, 2)" if state else ""
+    more = "assert many._block.fields['mean_error'].shape == (1, 1, 1, 2)" if state else ""
     (tmp_path / "check.py").write_text(CHECK + names + STUDIES + more + '\nprint("fine")\n', encoding="utf-8")
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(package.parent), str(ROOT / "tests")])}
     command = [sys.executable, "-W", "error", "check.py"]

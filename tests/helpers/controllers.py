@@ -189,10 +189,11 @@ class OwnController:
     def listen(self, references: Any, errors: Any) -> None:
         self.x = [*references[:-9:-1], *self.x][:8]
 
+    def state(self) -> dict[str, Any]:
+        return vars(self)
 
-def own_amplifier(sample: float) -> float:
-    """Return the output of a user's amplifier."""
-    return min(max(sample, -0.8), 0.8)
+    def restore(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
 
 
 def _filterpys(kind: type = KalmanFilter, **settings: Any) -> Any:
@@ -248,7 +249,6 @@ AROUND: dict[str, Any] = {
     "VerifiedController": lambda: quickly_verified(FxLMS(N_TAPS, -S_HAT, step_size=MU)),
     "VerifiedController, wrong path": lambda: quickly_verified(kf_anc(N_TAPS, -S_HAT, **KALMAN)),
     "VerifiedController, amplifier": lambda: quickly_verified(MAKERS["KF-OPC"](), amplifier=HardClipAmplifier(0.7)),
-    "VerifiedController, a user's amplifier": lambda: quickly_verified(MAKERS["KF-ANC"](), amplifier=own_amplifier),
     "VerifiedController, a user's": lambda: quickly_verified(OwnController()),
     "VerifiedController, many": lambda: quickly_verified(SEVERAL["FxLMS"]()),
     "FeedbackNeutralizer": lambda: FeedbackNeutralizer(quickly_verified(MAKERS["FxLMS"]()), [0.0, 0.1, 0.05]),
@@ -269,7 +269,7 @@ AROUND: dict[str, Any] = {
         kf_anc(L, PATHS[2:], **KALMAN, **MANY), PATHS, _observer(), physical=[0, 1]
     ),
 }
-OWN = (OwnFilter, OwnController, own_amplifier)  # what loading them needs beyond the package
+OWN = (OwnFilter, OwnController)  # what loading them needs beyond the package
 
 ALL: dict[str, Any] = {f"{name} {variant}": lambda n=name, v=variant: made(n, v) for name, variant in VARIANTS}
 ALL |= {f"{name} many": make for name, make in SEVERAL.items()} | IN_BLOCKS | AROUND

@@ -33,6 +33,12 @@ class Loud:
     def update(self, error: float) -> None:
         pass
 
+    def state(self) -> None:
+        """It keeps nothing."""
+
+    def restore(self, state: None) -> None:
+        pass
+
 
 MAKERS: dict[str, Any] = {
     "a user's": lambda: LimitedController(Loud(), limiter()),
@@ -44,8 +50,8 @@ MAKERS: dict[str, Any] = {
 
 def again(supervisor: Supervisor) -> Supervisor:
     with TemporaryDirectory() as folder:
-        supervisor.save(Path(folder, "run.kfopc"))
-        return Supervisor.load(Path(folder, "run.kfopc"), trusted=[Loud])
+        supervisor.save(Path(folder, "run.npz"))
+        return Supervisor.load(Path(folder, "run.npz"), classes=[Loud])
 
 
 @settings(max_examples=30, deadline=None)
