@@ -3,11 +3,11 @@
 from kfopc_filterpy.verdict.items import FigureItem, Sound, Table
 from kfopc_filterpy.verdict.runs import AllDivergedError
 
-from .opening import claims_sentence
+from .merit import figures_of_merit
 from .registry import Algorithm, algorithms, make_controller
 from .report import results_table, write_report
-from .scene import Runs, Scene, figures_of_merit, make_scene, with_clipping
-from .study_report import Claim, Parameter, StudyReport
+from .scene import Runs, Scene, make_scene, with_clipping
+from .study_report import Claim, Parameter, StudyReport, claims_sentence
 from .tuning import Trial, Tuned, best_setting, run_setting, run_settings, try_settings, tune
 
 __all__ = [

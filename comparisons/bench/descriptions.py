@@ -1,9 +1,5 @@
 """What each algorithm of the registry is, in one sentence."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable
-
 DESCRIPTIONS = {
     "KF-ANC": "a Kalman filter that learns the control filter and knows no rated power",
     "KF-OPC": "KF-ANC with the disturbance scaled by a constraint factor, which is meant to keep the rated power",
@@ -25,8 +21,3 @@ DESCRIPTIONS = {
     "frequency-domain FxLMS": "FxLMS that adapts once per block, each frequency at its own rate; it knows no rated power",
     "power-limited FxLMS": "frequency-domain FxLMS with a price on the output power that follows the measured power",
 }
-
-
-def described(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Return the algorithms among `names` that have a description, each once, with it."""
-    return [(name, DESCRIPTIONS[name]) for name in dict.fromkeys(names) if name in DESCRIPTIONS]

@@ -1,4 +1,4 @@
-"""The writer of the report: a page, figures, sounds, results.json, and a table for the terminal."""
+"""The report: one page that needs no other file, with its figures, sounds, tables and results.json; and as text."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ import os
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from kfopc_filterpy._writing import prepare_folder, replacing_files, write_whole
-from kfopc_filterpy.plot import save_figure
-from kfopc_filterpy.verdict.items import Table, aligned, write_files
+from kfopc_filterpy._writing import jsonable, prepare_folder, replacing_files, write_whole
+from kfopc_filterpy.verdict.items import write_files
+from kfopc_filterpy.verdict.page import images, players, rendered
 
-from .opening import claims_sentence, glance
-from .report_page import page
-from .study_report import StudyReport, merit_table, require_different
+from .descriptions import DESCRIPTIONS
+from .merit import MERITS
+from .study_report import StudyReport, claims_sentence, require_different
 
-SCREEN_ROWS = 30  # of a table that fits a screen, with the claims above it
+SCREEN_ROWS = 30  # of a table that fits a screen
+TEMPLATE = Path(__file__).with_name("report.html.jinja")
 
 
 def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str]) -> Path:
@@ -56,22 +58,47 @@ def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str])
     results = json.dumps(
         {"studies": {study.name: study.result for study in studies}}, allow_nan=False, ensure_ascii=False, indent=2
     )
-    path, lead = prepare_folder(folder), glance(studies)
+    path = prepare_folder(folder)
     with replacing_files(path) as new:
-        if lead is not None:
-            save_figure(lead.figure, new / "figures" / lead.stem)
         for study in studies:
-            write_files(new, study.name, fs=study.fs, figures=study.figures, sounds=study.sounds, tables=study.tables)
+            write_files(
+                new, study.name, fs=study.fs, figures=study.figures, sounds=study.sounds, tables=study.all_tables
+            )
         write_whole(new / "results.json", results + "\n")
-        write_whole(new / "report.html", page(studies, new, lead))
+        write_whole(new / "report.html", _page(studies, new))
     return path / "report.html"
 
 
-def results_table(studies: Sequence[StudyReport]) -> str:
-    """Return the studies' results as text for a terminal: the claims and one table, so that a study fits a screen.
+def _page(studies: Sequence[StudyReport], folder: Path) -> str:
+    """Return the page; the files of its figures and sounds lie in `folder`."""
+    parts = [
+        {
+            "study": study,
+            "tables": [table for table in study.all_tables if table.stem != "claims"],
+            "figures": images(folder, study.name, study.figures),
+            "players": list(players(folder, study.name, study.sounds, study.fs)),
+            "parameters": [(name, _text(jsonable(own.value)), own.chosen) for name, own in study.parameters.items()],
+        }
+        for study in studies
+    ]
+    names = dict.fromkeys(name for study in studies for name in study.algorithms)
+    described = {name: DESCRIPTIONS[name] for name in names if name in DESCRIPTIONS}
+    return rendered(TEMPLATE, parts=parts, claims=claims_sentence(studies), described=described, merits=MERITS)
 
-    The table is that of the figures of merit or, without them, the first that fits. All tables are in the report. What has
-    no claims shows all its tables that fit.
+
+def _text(value: Any) -> str:
+    """Return a value of JSON as text: a line for each row of a table, and for each key of a mapping."""
+    if isinstance(value, list):
+        return ("\n" if any(isinstance(item, list) for item in value) else ", ").join(map(_text, value))
+    if isinstance(value, dict):
+        return "\n".join(f"{key.replace('_', ' ')}: {_text(item)}" for key, item in value.items())
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "–" if value is None else str(value)
+
+
+def results_table(studies: Sequence[StudyReport]) -> str:
+    """Return the studies' results as text for a terminal: all tables that fit a screen; the report has the others, too.
 
     Parameters
     ----------
@@ -88,39 +115,25 @@ def results_table(studies: Sequence[StudyReport]) -> str:
     >>> from comparisons.bench import StudyReport, Claim, results_table
     >>> study = StudyReport(
     ...     "tonal", "A tone", "", 16000, 1.0, {}, {"KF-OPC": {"noise_reduction_db": 10.1, "output_power": 0.9999}},
-    ...     claims=[Claim("KF-OPC keeps its rated power", True, "0.9999 of 1")],
+    ...     claims=[Claim("KF-OPC's output power over the rated one", 0.9999, at_most=1.02)],
     ... )
     >>> print(results_table([study]))
-    tonal: A tone (rated power 1)
-            noise reduction  output power  of rated power  peak control signal  clipped  harmonics  converged  diverged
-                         dB                         times                             %         dB          s         s
-    KF-OPC             10.1        0.9999          0.9999                    -        -          -          -         -
-      REPRODUCED      KF-OPC keeps its rated power
-                      0.9999 of 1
+    tonal: A tone
     <BLANKLINE>
-    The one claim of the paper was reproduced.
+    Claims
+           measured  holds if      claim                                     note
+    holds    0.9999  at most 1.02  KF-OPC's output power over the rated one
+    <BLANKLINE>
+    Figures of merit
+    algorithm  noise reduction (dB)  output power  of the rated power
+    KF-OPC                     10.1        0.9999              0.9999
+    <BLANKLINE>
+    1 of 1 claims hold
     """
     lines = []
     for study in studies:
-        lines.append(f"{study.name}: {study.title} (rated power {study.rating})")
-        if study.algorithms:
-            columns, rows = merit_table(study)
-            heads = [["", *head] for head in zip(*columns, strict=True)]
-            named = [[name, *row] for name, row in zip(study.algorithms, rows, strict=True)]
-            lines += aligned([*heads, *named], {0})
-        for claim in study.claims:
-            mark = study.marks[0 if claim.holds else 1].upper()
-            lines += textwrap.wrap(claim.text, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
-            lines += textwrap.wrap(claim.measured, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
-        for table in _on_a_screen(study):
-            lines += ["", *textwrap.wrap(table.caption, 116), *table.lines]
-        lines.append("")
-    return "\n".join([*lines, *textwrap.wrap(claims_sentence(studies), 116)])
-
-
-def _on_a_screen(study: StudyReport) -> list[Table]:
-    """Return the tables that a terminal shows beside the figures of merit and the claims."""
-    fitting = [table for table in study.tables if len(table.rows) <= SCREEN_ROWS]
-    if not study.claims:
-        return fitting
-    return [] if study.algorithms else fitting[:1]
+        lines += [f"{study.name}: {study.title}", ""]
+        for table in study.all_tables:
+            if len(table.rows) <= SCREEN_ROWS:
+                lines += [*textwrap.wrap(table.caption, 116), *table.lines, ""]
+    return "\n".join([*lines, claims_sentence(studies)]).rstrip()

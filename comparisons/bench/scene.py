@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, SimulationResult, metrics, simulate, simulate_scenarios
+from kfopc_filterpy import HardClipAmplifier, SimulationResult, simulate, simulate_scenarios
 from kfopc_filterpy._types import Counter, NumberOrArray, PathModels
 from kfopc_filterpy._validate import as_channels, as_positive, as_signal, per_loudspeaker
 from kfopc_filterpy.bounds import (
@@ -402,50 +402,3 @@ def reachable_weights() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", np.exceptions.RankWarning)
         yield
-
-
-def figures_of_merit(results: Sequence[SimulationResult], scene: Scene) -> dict[str, float | None]:
-    """Return the figures of merit of one algorithm: means over seeds, the NSE pooled over seeds.
-
-    With several loudspeakers, the figures of the control signal are those of the loudspeaker for which they are largest
-    over its rating: powers over the rated power, peaks over its root. With several microphones, the errors are taken
-    together.
-
-    Parameters
-    ----------
-    results : sequence of SimulationResult
-        Runs of the algorithm, one for each seed.
-    scene : Scene
-        Scene of the runs.
-
-    Returns
-    -------
-    dict of str to float or None
-        The keys that a `StudyReport` takes; None if undefined.
-
-    Examples
-    --------
-    >>> from comparisons.bench import figures_of_merit, make_controller, make_scene
-    >>> from kfopc_filterpy.signals import tone
-    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
-    ...                    power_multiple=2.0, n_taps=8)
-    >>> figures = figures_of_merit([scene.run(make_controller(scene, "KF-OPC", 1e-6))], scene)
-    >>> round(figures["output_power"], 2)
-    1.0
-    """
-    scale = np.sqrt(scene.rated_power) if np.ndim(scene.rated_power) else np.ones(())
-    limit, control = scene.amplitude_limit / scale, [r.control_signal / scale[..., np.newaxis] for r in results]
-    diverged = [r.diverged_at_s for r in results if r.diverged_at_s is not None]
-    errors = np.array([r.error for r in results])
-    disturbances = np.array([r.disturbance for r in results])
-    return {
-        "noise_reduction_db": float(np.mean([metrics.noise_reduction_db(r.error, r.disturbance) for r in results])),
-        "output_power": float(np.mean([np.max(metrics.output_power(y)) for y in control])),
-        "peak_control_signal": float(np.mean([np.max(metrics.peak_control_signal(y)) for y in control])),
-        "clipped_fraction": float(np.mean([np.max(metrics.clipped_fraction(y, limit)) for y in control])),
-        "harmonics_db": None,
-        "convergence_time_s": metrics.convergence_time_s(
-            errors, disturbances, scene.fs, window_s=scene.nse_window_s, runs=True
-        ),
-        "diverged_at_s": min(diverged) if diverged else None,
-    }

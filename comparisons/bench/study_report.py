@@ -1,45 +1,57 @@
-"""`StudyReport`, everything that the report says of one study: claims, parameters, tables, figures, sounds."""
+"""`StudyReport`, everything that the report says of one study: claims, tables, figures, sounds, parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any
+
+import numpy as np
 
 from kfopc_filterpy._writing import jsonable
 from kfopc_filterpy.verdict.items import FigureItem, Sound, Table, require_stem
 
-MERIT_COLUMNS = (  # heading, unit, figure of merit and format
-    ("noise reduction", "dB", "noise_reduction_db", ".1f"),
-    ("output power", "", "output_power", ".5g"),
-    ("of rated power", "times", "output_power", ".4g"),
-    ("peak control signal", "", "peak_control_signal", ".4g"),
-    ("clipped", "%", "clipped_fraction", ".2f"),
-    ("harmonics", "dB", "harmonics_db", ".1f"),
-    ("converged", "s", "convergence_time_s", ".4g"),
-    ("diverged", "s", "diverged_at_s", ".4g"),
-)
-FIGURES_OF_MERIT = tuple(dict.fromkeys(figure for _, _, figure, _ in MERIT_COLUMNS))
-OF_THE_PAPER = "Claims of the paper"
+from .merit import MERITS, merit_table
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of a study, and what was measured.
+    """A claim of a study: a number that was measured, and the limits within which the claim holds.
 
     Parameters
     ----------
     text : str
-        The claim as a sentence.
-    holds : bool
-        Whether it holds.
-    measured : str
-        What was measured, in words.
+        The claim, with the unit of the number.
+    value : float
+        What was measured.
+    at_most, at_least : float, optional
+        The largest and the smallest value with which it holds. NaN never holds.
+    note : str, default ""
+        Where it was measured, or what belongs to it, in a few words.
+
+    Examples
+    --------
+    >>> Claim("KF-PB's output power over the rated one", 0.99, at_most=1.02).holds
+    True
     """
 
     text: str
-    holds: bool
-    measured: str
+    value: float
+    at_most: float = np.inf
+    at_least: float = -np.inf
+    note: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """Whether the value is within the limits."""
+        return bool(self.at_least <= self.value <= self.at_most)
+
+    @property
+    def limits(self) -> str:
+        """The limits in words."""
+        if np.isfinite(self.at_most) and np.isfinite(self.at_least):
+            return f"{self.at_least:g} to {self.at_most:g}"
+        return f"at most {self.at_most:g}" if np.isfinite(self.at_most) else f"at least {self.at_least:g}"
 
 
 @dataclass(frozen=True)
@@ -75,7 +87,7 @@ class StudyReport:
     parameters : dict of str to Parameter
         Every parameter by name.
     algorithms : dict of str to dict, optional
-        Figures of merit by algorithm: keys out of `FIGURES_OF_MERIT`; None, NaN or left out if undefined.
+        Figures of merit by algorithm: keys out of `MERITS`; None, NaN or left out if undefined.
     extra : dict of str to Any
         Further figures for results.json: numbers, text, arrays, lists and mappings of them.
     claims : list of Claim
@@ -88,11 +100,6 @@ class StudyReport:
         Further remarks.
     tables : list of Table
         Further tables in their order.
-    claims_heading : str
-        What the claims are: "Claims of the paper", which are reproduced or not; all others, such as "Aims", are met or
-        not.
-    watt_per_power : float, optional
-        Power in W of a mean square of 1, if it is known: page and terminal then show output powers in W.
 
     Raises
     ------
@@ -113,31 +120,28 @@ class StudyReport:
     sounds: list[Sound] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
-    claims_heading: str = OF_THE_PAPER
-    watt_per_power: float | None = None
 
     def __post_init__(self) -> None:
         require_stem(self.name, "name")
         for algorithm, figures in self.algorithms.items():
-            if unknown := set(figures) - set(FIGURES_OF_MERIT):
+            if unknown := set(figures) - set(MERITS):
                 raise ValueError(
                     f"algorithms[{algorithm!r}] holds unknown figures of merit {sorted(unknown)}; "
-                    f"known are {', '.join(FIGURES_OF_MERIT)}; further ones belong into extra"
+                    f"known are {', '.join(MERITS)}; further ones belong into extra"
                 )
-        for items, kind in ((self.figures, "figures"), (self.sounds, "sounds"), (self.tables, "tables")):
+        for items, kind in ((self.figures, "figures"), (self.sounds, "sounds"), (self.all_tables, "tables")):
             require_different((item.stem for item in items), f"{kind} of study {self.name!r}")
 
     @property
-    def marks(self) -> tuple[str, str]:
-        """Words for a claim that holds, and for one that does not."""
-        return ("reproduced", "not reproduced") if self.claims_heading == OF_THE_PAPER else ("met", "not met")
-
-    @property
-    def rating(self) -> str:
-        """The rated power in words, in W if that is known."""
-        if self.watt_per_power is None:
-            return f"{self.rated_power:.4g}"
-        return f"{self.rated_power * self.watt_per_power:.4g} W"
+    def all_tables(self) -> list[Table]:
+        """The claims, the figures of merit and the further tables, those that have rows."""
+        claims = [["holds" if one.holds else "fails", one.value, one.limits, one.text, one.note] for one in self.claims]
+        tables = [
+            Table("claims", "Claims", ["", "measured", "holds if", "claim", "note"], claims),
+            merit_table(self.algorithms, self.rated_power),
+            *self.tables,
+        ]
+        return [table for table in tables if table.rows]
 
     @property
     def result(self) -> dict[str, Any]:
@@ -145,30 +149,27 @@ class StudyReport:
         values = {
             "rated_power": self.rated_power,
             "parameters": {name: parameter.value for name, parameter in self.parameters.items()},
-            "algorithms": {
-                name: {key: figures.get(key) for key in FIGURES_OF_MERIT} for name, figures in self.algorithms.items()
-            },
-            "claims": [vars(claim) for claim in self.claims],
+            "algorithms": {name: {key: own.get(key) for key in MERITS} for name, own in self.algorithms.items()},
+            "claims": [asdict(claim) | {"holds": claim.holds} for claim in self.claims],
             "extra": self.extra,
         }
         return jsonable(values, f"study {self.name!r}")
 
 
-def merit_table(study: StudyReport) -> tuple[list[tuple[str, str]], list[list[str]]]:
-    """Return the headings and units of the figures of merit, and the cells of each algorithm, "-" if there is no figure."""
-    watt = study.watt_per_power
-    factors = {"output power": watt or 1.0, "of rated power": 1 / study.rated_power, "clipped": 100.0}
-    units = {"output power": "" if watt is None else "W"}
-    headings = [(heading, units.get(heading, unit)) for heading, unit, *_ in MERIT_COLUMNS]
+def claims_sentence(studies: Sequence[StudyReport]) -> str:
+    """Return how many claims hold, and in which studies some do not; empty if there are no claims.
 
-    def cell(value: float | None, heading: str, form: str) -> str:
-        return "-" if value is None else f"{value * factors.get(heading, 1.0):{form}}"
-
-    rows = [
-        [cell(jsonable(figures.get(key)), heading, form) for heading, _, key, form in MERIT_COLUMNS]
-        for figures in study.algorithms.values()
-    ]
-    return headings, rows
+    Examples
+    --------
+    >>> kept, over = Claim("Output power", 1.0, at_most=1.02), Claim("Output power", 1.7, at_most=1.02)
+    >>> claims_sentence([StudyReport(name, name, "", 16000, 1.0, {}, claims=[kept, own])
+    ...                  for name, own in (("a", kept), ("b", over))])
+    '3 of 4 claims hold; 1 of b fails'
+    """
+    failed = {study.name: sum(not claim.holds for claim in study.claims) for study in studies}
+    total = sum(len(study.claims) for study in studies)
+    others = "".join(f"; {count} of {name} fails" for name, count in failed.items() if count)
+    return f"{total - sum(failed.values())} of {total} claims hold{others}" if total else ""
 
 
 def require_different(names: Iterable[str], what: str) -> None:

@@ -15,6 +15,7 @@ from . import kf_pb_cases as cases
 from .cases import FS, SENSOR_NOISE_DB, Pair
 from .kf_pb_cases import FAULTS, STEADY, fixed_filters, make_rated, with_any_power
 from .report_parts import new_figure, report_of_rows, without_measured
+from .rows import grouped
 
 LONG = 4 * cases.N_TAPS  # taps that stand for a filter of any length
 FAULT = "two samples early"  # of the estimate that KF-PB gets to verify
@@ -95,7 +96,24 @@ def main(runs: Runs) -> StudyReport:
         },
         figures=[loss_figure(rows)],
         notes=without_measured(pairs),
-        tables=[loss_table(rows)],
+        tables=[mean_table(rows), loss_table(rows)],
+    )
+
+
+def mean_table(rows: Sequence[LossRow]) -> Table:
+    """Return a line for each pair of paths: means over the noises."""
+    return Table(
+        "means",
+        "Noise reduction lost at each stage and left, in dB, means over the noises; a negative loss is a gain",
+        ["path", *STAGES, "left"],
+        [
+            [
+                path,
+                *np.mean([row.losses_db for row in own], axis=0),
+                float(np.mean([row.reduction_db[-1] for row in own])),
+            ]
+            for (path,), own in grouped(rows, "path").items()
+        ],
     )
 
 

@@ -114,7 +114,6 @@ def main(runs: Runs) -> StudyReport:
             _table("reduction", "Noise reduction over the steady half in dB, of all microphones together", rows),
             _table("power", "Largest output power of a loudspeaker over its rated power, steady half", rows, "power"),
         ],
-        claims_heading="Aims",
     )
 
 

@@ -24,7 +24,7 @@ BANDPASS_PATHS = {
 
 def report_of_rows(rows: Iterable[Any], **report: Any) -> StudyReport:
     """Return the report of a study beyond the paper, with its rows for results.json."""
-    own: dict[str, Any] = {"fs": FS, "rated_power": 1.0, "claims_heading": "Findings"} | report
+    own: dict[str, Any] = {"fs": FS, "rated_power": 1.0} | report
     return StudyReport(**own | {"extra": {"rows": [asdict(row) for row in rows]} | own.get("extra", {})})
 
 

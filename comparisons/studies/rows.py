@@ -79,20 +79,16 @@ def column(rows: Iterable[Any], name: str) -> np.ndarray:
     return np.array([getattr(row, name) for row in rows])
 
 
-# ---- Words
+# ---- Claims and words
 
 
-def worst(losses: Mapping[Any, float]) -> tuple[Any, float]:
-    """Return the largest of the losses, and whose it is; NaN, of a run that diverged, counts as the largest."""
-    where = list(losses)[int(np.argmax(list(losses.values())))]
-    return where, losses[where]
-
-
-def loss_claim(text: str, most_db: float, losses_db: Mapping[Any, float], below: str = "") -> Claim:
-    """Return the claim that no loss is larger than `most_db`."""
-    where, loss = worst(losses_db)
-    mean = np.mean(list(losses_db.values()))
-    return Claim(text, loss <= most_db, f"{mean:z.2f} dB{below} on average, {loss:z.2f} dB at worst ({where})")
+def worst_claim(text: str, values: Mapping[Any, float], *, at_most: float = np.inf, at_least: float = -np.inf) -> Claim:
+    """Return the claim at the worst of some values, with where that is and their mean; NaN, of a run that diverged, is worst."""
+    if not values:
+        return Claim(text, np.nan, at_most, at_least, "nothing to compare with")
+    own = np.array(list(values.values()))
+    k = int(np.argmax(own) if np.isfinite(at_most) else np.argmin(own))
+    return Claim(text, float(own[k]), at_most, at_least, f"{list(values)[k]}; mean {np.mean(own):.3g}")
 
 
 def span(values: Iterable[float], form: str = ".3g") -> str:

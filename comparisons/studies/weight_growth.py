@@ -8,29 +8,14 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult
 
-MANY_TIMES = 10.0  # the optimal weight
-LINEAR_TOLERANCE = 0.1
-CONSTANT_TOLERANCE = 0.01
-
 
 @dataclass(frozen=True)
 class Growth:
-    """How the largest weight of a control filter grew; all fields but `diverged_at_s` are ratios."""
+    """How the largest weight of a control filter grew, as ratios."""
 
     over_optimal: float  # at the end, over the largest weight of the Wiener solution
     over_half: float  # at the end, over that at half of the run
     of_quarters: float  # growth in the last quarter, over that in the second: 1 on a straight line
-    diverged_at_s: float | None = None
-
-    @property
-    def linear_without_bound(self) -> bool:
-        """Whether it grows in a straight line, and is far beyond the optimum."""
-        return self.over_optimal >= MANY_TIMES and abs(self.of_quarters - 1.0) <= LINEAR_TOLERANCE
-
-    @property
-    def none(self) -> bool:
-        """Whether it keeps its size."""
-        return abs(self.over_half - 1.0) <= CONSTANT_TOLERANCE
 
 
 def growth_of(result: SimulationResult, optimal_weight: float) -> Growth:
@@ -39,4 +24,4 @@ def growth_of(result: SimulationResult, optimal_weight: float) -> Growth:
     largest = np.abs(result.weights).max(axis=1)
     quarter, half, three, end = (float(largest[k * (largest.size - 1) // 4]) for k in (1, 2, 3, 4))
     gained = (end - three) / (half - quarter) if half != quarter else np.inf
-    return Growth(end / optimal_weight, end / half, gained, result.diverged_at_s)
+    return Growth(end / optimal_weight, end / half, gained)

@@ -1,8 +1,7 @@
-"""The study of a secondary path that is known within a tolerance: small, and its claims from rows made by hand."""
+"""The study of a secondary path that is known within a tolerance: small, and its claims."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from comparisons.studies.uncertain_path import (
     NOTHING,
     STATED,
     AllowanceRow,
-    claims,
     seconds_db,
 )
 from kfopc_filterpy import SimulationResult, simulate
@@ -71,44 +69,18 @@ class _Half:
         pass
 
 
-# ---- Claims on rows made by hand
+def test_claims_from_rows_made_by_hand() -> None:
+    def row(noise: str, error: str, allowance: str, reduction_db: float, **figures: Any) -> AllowanceRow:
+        place = {"path": "duct", "noise": noise, "algorithm": "KF-PB", "error": error, "allowance": allowance}
+        return AllowanceRow(**place, noise_reduction_db=reduction_db, **{"worst_second_db": 1.0} | figures)  # type: ignore[arg-type]
 
-
-def row(noise: str = "white", error: str = "a sample late", allowance: str = DEFAULT, **figures: Any) -> AllowanceRow:
-    place = {"path": "duct", "noise": noise, "algorithm": "KF-PB", "error": error, "allowance": allowance}
-    return AllowanceRow(**place, **{"noise_reduction_db": 5.0, "worst_second_db": 1.0, "power": 1.0} | figures)
-
-
-GOOD = [
-    *(
-        row(noise, error, allowance, noise_reduction_db=5.0 if allowance == NOTHING else 4.6)
-        for noise in ("motor", "white")
-        for error, allowance in (
-            ("exact", NOTHING),
-            ("exact", DEFAULT),
-            ("a sample late", DEFAULT),
-            ("a sample late", STATED),
-            (IDENTIFIED, STATED),
-        )
-    ),
-    row(allowance=NOTHING, worst_second_db=-7.0),
-]
-
-
-@pytest.mark.parametrize(
-    ("at", "figures", "finding"),
-    [
-        (2, {"worst_second_db": -0.1}, 0),
-        (2, {"diverged_at_s": 1.0}, 0),
-        (3, {"worst_second_db": np.nan}, 1),
-        (1, {"noise_reduction_db": 4.4}, 2),
-        (6, {"noise_reduction_db": 4.4}, 3),
-        (6, {"noise_reduction_db": np.nan, "diverged_at_s": 1.0}, 3),
-        (4, {"noise_reduction_db": 4.4}, 4),
-        (9, {"noise_reduction_db": 4.4}, 4),
-    ],
-)
-def test_each_finding_fails_alone(at: int, figures: dict[str, Any], finding: int) -> None:
-    assert all(claim.holds for claim in claims(GOOD))
-    changed = [replace(one, **figures) if n == at else one for n, one in enumerate(GOOD)]
-    assert [n for n, claim in enumerate(claims(changed)) if not claim.holds] == [finding]
+    rows = []
+    for noise, cost in (("motor", 0.25), ("white", 0.75)):
+        rows += [row(noise, "exact", NOTHING, 5.0), row(noise, "exact", DEFAULT, 5.0 - cost)]
+        rows += [row(noise, IDENTIFIED, STATED, 4.5), row(noise, "a sample late", DEFAULT, 4.0)]
+        rows.append(row(noise, "a sample late", STATED, np.nan, diverged_at_s=1.0))
+    claims = uncertain_path.claims(rows)
+    assert [claim.value for claim in claims] == pytest.approx([-1.0, np.inf, 0.25, 0.75, 0.5])
+    assert [claim.holds for claim in claims] == [True, False, True, False, True]
+    louder = {line[0]: line[1:] for line in uncertain_path.louder_table(rows).rows}
+    assert louder == {STATED: [4, 2, np.inf], DEFAULT: [2, 0, -1.0]}

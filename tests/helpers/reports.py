@@ -38,7 +38,10 @@ def study(name: str = "tonal", **changes: Any) -> StudyReport:
             "KF-OPC": {"output_power": 0.79971, "clipped_fraction": 0.25, "harmonics_db": float("nan")},
         },
         "extra": {"sweep": {"over_db": np.arange(2), "best": np.array([1.0, -np.inf])}, "flip": np.float32(4.5)},
-        "claims": [Claim("KF-OPC < rated", True, "0.79971 of 0.8"), Claim("it is faster", np.bool_(False), "no")],
+        "claims": [
+            Claim("KF-OPC < rated", 0.99964, at_most=1.0),
+            Claim("It is faster (s)", np.float64(2.0), at_least=3.0, note="a <note>"),
+        ],
         "figures": [FigureItem("a-spectra", 'Spectra "of" e & d.', figure())],
         "sounds": [Sound("disturbance", "Disturbance", D), Sound("kf-anc", "Residual", np.append(D[:-1] / 2, np.nan))],
         "notes": ["One <note>."],
