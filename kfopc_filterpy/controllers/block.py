@@ -9,13 +9,13 @@ from scipy.fft import irfft, next_fast_len, rfft
 from .._types import NumberOrArray, PathModels
 from .._validate import as_count
 from ..checkpoint import Checkpointed
+from ..core.block import LOUDEST, LOUDEST_LEARNT
 from .base import calls_of, require_rates
-from .channel_samples import LOUDEST, require_moderate
+from .channel_samples import require_moderate
 from .channels import Channels
 from .processing import BlockProcessing, checked_block
 
-LOUDEST_ERROR = 1e100  # above what weights up to MOST_WEIGHT can cause, so that they can adapt down again
-MOST_WEIGHT = 1e80  # a step that leads beyond it is left out
+MOST_WEIGHT = 1e80  # a step that leads beyond it is left out; the error of such weights is below LOUDEST: they adapt on
 ROUNDING = 1e-12  # -120 dB; rounding errors are at -300 dB
 TINY = float(np.finfo(float).tiny)
 
@@ -205,7 +205,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
 
     def take(self, errors: np.ndarray, taken: ArrayLike = True) -> None:
         """Take the errors (K, n) that the last n control signals left; `taken`, (n,), says which of them to adapt to."""
-        require_moderate(errors, "error", LOUDEST_ERROR)
+        require_moderate(errors, "error", LOUDEST)
         here = slice(self._n - errors.shape[1], self._n)
         self._taken[here] = taken
         self._errors[:, here] = np.where(self._taken[here], errors, 0.0)
@@ -242,7 +242,7 @@ class BlockController(Channels, BlockProcessing, Checkpointed):
     ) -> np.ndarray:
         """Return the control signals for a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
         x, e, flags, y = checked_block(self, references, errors, adapt, out)
-        loud = np.abs(x).max() > LOUDEST or np.abs(e).max() > LOUDEST_ERROR
+        loud = np.abs(x).max() > LOUDEST_LEARNT or np.abs(e).max() > LOUDEST
         if loud or not runs_in_blocks(self):
             return super().process(x, e, adapt=flags, out=y)  # up to the sample that is refused
         begin, signals = 0, [np.atleast_2d(signal) for signal in (x, e, y)]

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_real_array
+from ..core.block import LOUDEST_LEARNT
 from ..power.amplifiers import Amplifiers, LinearAmplifier, amplifier_of_each
-
-LOUDEST = 1e20  # of the samples that can be learned from, see `plant.h`
 
 
 def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndarray:
@@ -24,7 +23,7 @@ def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndar
     return np.ascontiguousarray(sample)
 
 
-def require_moderate(signal: np.ndarray, name: str, most: float = LOUDEST) -> None:
+def require_moderate(signal: np.ndarray, name: str, most: float = LOUDEST_LEARNT) -> None:
     """Raise ValueError for samples from which a state could overflow."""
     if np.abs(signal).max() > most:
         raise ValueError(f"{name} must not be louder than {most:g}: scale the signals; nothing was changed")

@@ -14,9 +14,20 @@ from .core_controller import CoreController
 DEFAULT_UNCERTAINTY = 0.3  # relative rms error of a secondary path
 LEAST_SPREAD, MOST_SPREAD = 1e-4, 1e3  # of a path that is not exact
 BLOCK_S = 0.032  # from one posterior to the next, at least
-# What is known about the plant: fields of `plant.c`.
+# What is known about the plant: fields of `posterior.c`.
 POSTERIOR = (
-    *("plant", "plant_counts", "fits", "theta", "noise", "draws", "data", "data_of_errors", "error_energy", "factor"),
+    *(
+        "posterior",
+        "posterior_counts",
+        "fits",
+        "theta",
+        "noise",
+        "draws",
+        "data",
+        "data_of_errors",
+        "error_energy",
+        "factor",
+    ),
     *("inverse_diagonal", "set_aside_of_errors", "set_aside_energy", "path_correlation", "cross_correlation"),
 )
 
@@ -35,7 +46,7 @@ def relative_spread(uncertainty: Any, secondary_path: Any) -> float:
 
 
 class PosteriorController(CoreController):
-    """Base class of these controllers: what is known about the plant, read from the fields of `plant.c`."""
+    """Base class of these controllers: what is known about the plant, read from the fields of `posterior.c`."""
 
     checks: ClassVar = {"spread": as_nonnegative}
     takes_guard = False  # the posterior knows how far the path may be off

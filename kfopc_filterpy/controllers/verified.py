@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_channels, as_number, as_positive
+from ..core.block import LOUDEST_LEARNT
 from ..power.constraint import DEFAULT_FS
 from .base import Controller, WrappedController, listening
-from .channel_samples import LOUDEST, amplified, amplifier_functions, channel_sample, require_moderate
+from .channel_samples import amplified, amplifier_functions, channel_sample, require_moderate
 from .posterior import DEFAULT_UNCERTAINTY, LEAST_SPREAD, PathObserver, relative_spread
 
 AVERAGE_S = 0.1  # of the powers that are compared
@@ -246,7 +247,7 @@ class VerifiedController(WrappedController):
         own = np.reshape(self.controller.control_signal(reference), -1)
         if self._awaits_error:
             self._take(None)
-        if not np.all(np.abs(own) <= LOUDEST):
+        if not np.all(np.abs(own) <= LOUDEST_LEARNT):
             if self.volume > 0.0 or not self._is_fresh():
                 self._stop("not finite")
             own = np.zeros(len(self._withheld))

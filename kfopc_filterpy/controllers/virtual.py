@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from .._types import NumberOrArray, PathModels, PerMicrophone
 from .._validate import as_channels, as_count, as_real_array, per_channel, require_finite
+from ..core.block import LOUDEST
 from ..paths.observation import ObservationFilters
 from ..paths.path_matrix import secondary_paths
 from ..power.amplifiers import Amplifiers
@@ -370,7 +371,7 @@ class VirtualMicrophones(WrappedController):
             )
         for k in self.physical[~np.isfinite(heard[self.physical])]:
             raise ValueError(f"error must be finite, but that of microphone {k} is {heard[k]}")
-        require_moderate(heard[self.physical], "error", 1e100)
+        require_moderate(heard[self.physical], "error", LOUDEST)
         disturbance, virtual_error = self._estimate(heard)
         step(virtual_error)
         self.observer.advance(disturbance)

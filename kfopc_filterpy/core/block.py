@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import threading
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .library import Field, Library, at_cache_line, fields_of, load
+from .library import Field, Library, at_cache_line, constant, fields_of, load
 
 _STATE, _SETTING, _SCRATCH = range(3)
 _PRECISIONS: dict[str, np.dtype[Any]] = {"double": np.dtype(np.float64), "float": np.dtype(np.float32)}
@@ -20,15 +21,26 @@ SLACK = 64  # of delay lines, see signals.c
 _EACH = ("", "loudspeakers", "microphones")
 _step = ctypes.PYFUNCTYPE  # keeps the interpreter's lock
 
+LOUDEST, LOUDEST_LEARNT = constant("loudest"), constant("loudest_learnt")  # limits, see anc.h
+
 # What a step that was refused says: `anc_answer` in anc.h. Nothing was changed then.
 LOUD_REFERENCE, LOUD_ERROR, LOUD_ESTIMATE, LOUD_STEP, NO_SOLUTION = range(1, 6)
-REASONS = {
-    LOUD_REFERENCE: "the reference is too loud, above 1e25 over the gain of the secondary path: scale the signals",
-    LOUD_ERROR: "the error is too loud, above 1e100: scale the signals",
-    LOUD_ESTIMATE: "the disturbance estimate e + s^ * y is too loud, above 1e100, or 1e20 with an internal model: scale the signals",
-    LOUD_STEP: "the step of the weights is too large, above 1e50: use a smaller step size",
-    NO_SOLUTION: "the covariance P is too large: S = x' P x' + q could overflow",
-}
+
+
+def reasons(real: str = "double") -> dict[int, str]:
+    """Return why a step is refused, by its answer, for a type of numbers."""
+    names = ("loudest", "loudest_reference", "loudest_learnt", "longest_step")
+    loudest, reference, learnt, step = (f"1e{math.log10(constant(name, real)):.0f}" for name in names)
+    return {
+        LOUD_REFERENCE: f"the reference is too loud, above {reference} over the gain of the secondary path: scale the signals",
+        LOUD_ERROR: f"the error is too loud, above {loudest}: scale the signals",
+        LOUD_ESTIMATE: f"the disturbance estimate e + s^ * y is too loud, above {loudest}, or {learnt} with an internal model: scale the signals",
+        LOUD_STEP: f"the step of the weights is too large, above {step}: use a smaller step size",
+        NO_SOLUTION: "the covariance P is too large: S = x' P x' + q could overflow",
+    }
+
+
+REASONS = reasons()
 
 
 class _Plan(ctypes.Structure):

@@ -3,11 +3,11 @@
  *     y = v * x            asked of the loudspeakers
  *     e = p * x - s * y    heard by the microphones, and noise
  *
- * After every block of B samples, the posterior of p and s takes the block (plant.c). Then the filter of each loudspeaker in
+ * After every block of B samples, the posterior of p and s takes the block (posterior.c). Then the filter of each loudspeaker in
  * turn becomes the one of least expected error at the price of its power, (A + price R) v = b: A is the correlation of its
  * filtered references, R that of the references, b theirs with what the others leave of the disturbance. N = L + M - 1 taps
  * of a primary path are all that control can reach; `lags` is L + N. C_ab(l) = E[a(t) b(t - l)]. */
-#include "plant.h"
+#include "posterior.h"
 #include <string.h>
 
 enum { RATED_POWER, BLOCK, AVERAGING, WINDOW, SPREAD };
@@ -35,7 +35,7 @@ static const real LARGEST_TAP = 1e50, REGULAR = 1e-7, LEAST_POWER = 1e-300;
 
 typedef struct {
     signals s;
-    plant plant;
+    posterior posterior;
     int32_t T, lags;             /* blocks of the account */
     real *asked;                 /* (3, J) now; sum of squares of the block; the most that this sum may become */
     int32_t *controlled;         /* whether control was on in the block */
@@ -84,9 +84,9 @@ static void layout_budget(anc_view *view, const anc_plan *plan, const anc_settin
         return;
     }
     layout_unfiltered(s, plan, settings, at);
-    layout_posterior(&f->plant, s, (int32_t)block, !own || own[SPREAD - 1] == 0, at);
-    const int32_t I = s->I, L = s->L, N = f->plant.N, lags = L + N;
-    f->T = (int32_t)averaging, f->lags = lags, f->width = 2 * lags + f->plant.B;
+    layout_posterior(&f->posterior, s, (int32_t)block, !own || own[SPREAD - 1] == 0, at);
+    const int32_t I = s->I, L = s->L, N = f->posterior.N, lags = L + N;
+    f->T = (int32_t)averaging, f->lags = lags, f->width = 2 * lags + f->posterior.B;
     f->asked = reals(at, "asked", ANC_STATE, 1, 1, 3, J);
     f->controlled = int32s(at, "controlled", ANC_STATE, 1);
     f->R = reals(at, "reference_correlation", ANC_STATE, 1, I, I, lags);
@@ -119,14 +119,14 @@ static void set_room(budget *f)
 {
     const int32_t J = f->s.J;
     for (int32_t j = 0; j < J; j++)
-        f->asked[2 * J + j] = larger(MOST * (real)f->T - spent_by(f, j), 0) * (real)f->plant.B * f->s.setting[RATED_POWER][j];
+        f->asked[2 * J + j] = larger(MOST * (real)f->T - spent_by(f, j), 0) * (real)f->posterior.B * f->s.setting[RATED_POWER][j];
 }
 
 static void start_budget(anc_view *view, const anc_plan *plan, const anc_setting *settings)
 {
     budget *f = (budget *)view;
     start_signals(&f->s, plan, settings);
-    start_posterior(&f->plant, *f->s.setting[SPREAD]);
+    start_posterior(&f->posterior, *f->s.setting[SPREAD]);
     for (size_t n = 0; n < times(f->T, f->s.J); n++) f->book[n] = 1; /* spent before the start */
     set_room(f);
 }
@@ -322,11 +322,11 @@ static real price_of(const toeplitz_system *t, real power, real start, real *v)
 /* Add the block to the windows of the references; x is zero before the first, so they are positive definite. */
 static void take_references(budget *f)
 {
-    const int32_t I = f->s.I, L = f->s.L, B = f->plant.B;
+    const int32_t I = f->s.I, L = f->s.L, B = f->posterior.B;
     real g[SCALES + 1], fade[SCALES + 1];
     for (int c = 0; c <= SCALES; c++) g[c] = raised(*f->s.setting[WINDOW], SCALE[c]), fade[c] = raised(g[c], B);
     for (int32_t i = 0; i < I; i++) {
-        const real *u = history_of(&f->plant, i);
+        const real *u = history_of(&f->posterior, i);
         real share[SCALES + 1] = {1, 1, 1, 1}, sum[SCALES + 1] = {0};
         for (int32_t t = 0; t < B; t++)
             for (int c = 0; c <= SCALES; c++) work_row(f, c)[t] = share[c] * u[t], sum[c] += share[c], share[c] *= g[c];
@@ -335,7 +335,7 @@ static void take_references(budget *f)
             real *sums = work_row(f, WORKS - 1);
             for (int32_t a = 0; a < I; a++) {
                 real *restrict R = c ? f->short_R + times(((c - 1) * I + i) * I + a, L) : f->R + times(i * I + a, lags);
-                correlate(sums, work_row(f, c), B, history_of(&f->plant, a), lags);
+                correlate(sums, work_row(f, c), B, history_of(&f->posterior, a), lags);
                 for (int32_t l = 0; l < lags; l++) R[l] = faded(R[l], fade[c], sums[l]);
             }
             if (i == 0) f->weight[c] = fade[c] * f->weight[c] + sum[c];
@@ -370,12 +370,12 @@ static int32_t lasting(int32_t T, int32_t scale, int32_t least)
  * stand it if the last t goes on for twice as long, for every t. */
 static real share_of(const budget *f, int32_t j, const real *v, real taken)
 {
-    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, T = f->T, B = f->plant.B, least = T / SHORTEST;
+    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, T = f->T, B = f->posterior.B, least = T / SHORTEST;
     real power[SCALES + 2] = {taken}, spent = 0, share = 0; /* of all scales, and last that of the block */
     int32_t blocks[SCALES + 2];
     real *y = work_row(f, 0), *part = work_row(f, 1), *wide = work_row(f, 2);
     memset(y, 0, sizeof(real) * (size_t)B);
-    for (int32_t i = 0; i < I; i++) correlate(part, v + times(i, L), L, history_of(&f->plant, i), B), add_to(y, part, B);
+    for (int32_t i = 0; i < I; i++) correlate(part, v + times(i, L), L, history_of(&f->posterior, i), B), add_to(y, part, B);
     power[SCALES + 1] = dot(y, y, B) / (real)B, blocks[SCALES + 1] = least;
     for (int c = 0; c <= SCALES; c++) blocks[c] = lasting(T, SCALE[c], least);
     for (int32_t a = 0; a < I; a++) {
@@ -417,10 +417,10 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
         t.scale = t.A[(t.row_A + t.next_A) * (size_t)i + (size_t)(L - 1)] / larger(t.R[(t.row_R + t.next_R) * (size_t)i + (size_t)(L - 1)], LEAST_POWER);
     /* 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly only. */
     f->steady[j] = price_of(&t, rated, f->steady[j], v);
-    f->steady[J + j] = larger(f->steady[j], f->steady[J + j] * root(raised(*f->s.setting[WINDOW], f->plant.B)));
+    f->steady[J + j] = larger(f->steady[j], f->steady[J + j] * root(raised(*f->s.setting[WINDOW], f->posterior.B)));
     /* 3 What the account holds makes power cheaper, but none that saves little of the noise. */
     for (int n = 0; n < 4; n++) account *= account;
-    for (int32_t k = 0; k < f->s.K; k++) q += f->plant.q[k];
+    for (int32_t k = 0; k < f->s.K; k++) q += f->posterior.q[k];
     real price = larger(f->steady[J + j] * account, WORTHWHILE * q / (rated * (real)J));
     const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
     /* 4 The account must stand it. */
@@ -433,7 +433,7 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
 /* The correlations of the filtered references, and with the disturbance. */
 static void correlate_filtered(budget *f)
 {
-    const plant *p = &f->plant;
+    const posterior *p = &f->posterior;
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L, M = f->s.M, N = p->N, middle = f->lags - 1, lags = 2 * L - 1, both = 2 * f->lags - 1;
     real *part = work_row(f, 0);
     for (int32_t j = 0; j < J; j++)
@@ -461,7 +461,7 @@ static void solve_all(budget *f)
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L, n = I * L;
     const size_t row = (size_t)(2 * L - 1), row_A = times(J, I) * row;
     real *rest = taps_of(f, REST), *part = taps_of(f, PLAYED);
-    if (f->plant.counts[STALE]) expect(&f->plant);
+    if (f->posterior.counts[STALE]) expect(&f->posterior);
     correlate_references(f);
     correlate_filtered(f);
     for (int32_t j = 0; j < J; j++) {
@@ -480,18 +480,18 @@ static void solve_all(budget *f)
 
 static void end_block(budget *f)
 {
-    const int32_t J = f->s.J, B = f->plant.B;
+    const int32_t J = f->s.J, B = f->posterior.B;
     take_references(f);
     if (*f->controlled) {
         memmove(f->book + J, f->book, sizeof(real) * times(f->T - 1, J));
         for (int32_t j = 0; j < J; j++) f->book[j] = f->asked[J + j] / (real)B / f->s.setting[RATED_POWER][j];
     }
-    learn(&f->plant, root(raised(*f->s.setting[WINDOW], B)));
-    if (*f->plant.fits) solve_all(f);
+    learn(&f->posterior, root(raised(*f->s.setting[WINDOW], B)));
+    if (*f->posterior.fits) solve_all(f);
     *f->controlled = 0;
     memset(f->asked + J, 0, sizeof(real) * (size_t)J);
     set_room(f);
-    begin_block(&f->plant);
+    begin_block(&f->posterior);
 }
 
 /* Note a sample; at the end of a block, learn. */
@@ -499,20 +499,20 @@ static int note(budget *f, const real *error, int controlled)
 {
     const signals *s = &f->s;
     for (int32_t i = 0; i < s->I; i++)
-        if (!within(*newest(&s->x, i), LOUDEST_LEARNT)) return ANC_LOUD_REFERENCE;
+        if (!within(*newest(&s->x, i), anc_loudest_learnt)) return ANC_LOUD_REFERENCE;
     for (int32_t j = 0; j < s->J; j++)
-        if (!within(*newest(&s->y, j), LOUDEST_PLAYED) || !within(f->asked[j], LOUDEST_PLAYED)) return ANC_LOUD_REFERENCE;
+        if (!within(*newest(&s->y, j), anc_loudest) || !within(f->asked[j], anc_loudest)) return ANC_LOUD_REFERENCE;
     for (int32_t k = 0; error && k < s->K; k++)
-        if (!within(error[k], LOUDEST_LEARNT)) return ANC_LOUD_ERROR;
+        if (!within(error[k], anc_loudest_learnt)) return ANC_LOUD_ERROR;
     const int refused = error ? anc_take_error((anc_view *)f, error) : ANC_DONE;
     if (refused) return refused;
-    for (int32_t i = 0; i < s->I; i++) *place_of(&f->plant, i) = *newest(&s->x, i);
+    for (int32_t i = 0; i < s->I; i++) *place_of(&f->posterior, i) = *newest(&s->x, i);
     for (int32_t j = 0; j < s->J; j++) {
-        *place_of(&f->plant, s->I + j) = *newest(&s->y, j);
+        *place_of(&f->posterior, s->I + j) = *newest(&s->y, j);
         if (controlled) f->asked[s->J + j] += f->asked[j] * f->asked[j];
     }
     *f->controlled |= controlled;
-    if (complete_sample(&f->plant, error)) end_block(f);
+    if (complete_sample(&f->posterior, error)) end_block(f);
     return ANC_DONE;
 }
 
@@ -521,7 +521,7 @@ static int control_signal_budget(anc_view *view, const real *reference, real *co
     budget *f = (budget *)view;
     signals *s = &f->s;
     if (is_too_loud(s, reference)) return ANC_LOUD_REFERENCE;
-    if (f->plant.heard[AWAITED]) note(f, NULL, 1); /* that error never came */
+    if (f->posterior.heard[AWAITED]) note(f, NULL, 1); /* that error never came */
     const int refused = take_reference(s, reference);
     for (int32_t j = 0; !refused && j < s->J; j++) {
         const real y = filter_output(s, j), left = larger(f->asked[2 * s->J + j] - f->asked[s->J + j], 0);
@@ -529,7 +529,7 @@ static int control_signal_budget(anc_view *view, const real *reference, real *co
         emit(s, j, f->asked[j]);
         control[j] = s->control[j];
     }
-    f->plant.heard[AWAITED] = !refused;
+    f->posterior.heard[AWAITED] = !refused;
     return refused;
 }
 

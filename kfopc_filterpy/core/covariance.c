@@ -177,7 +177,7 @@ real project(covariance *c, real q)
     return variance < blur * owed->bound ? blurred(c, variance, blur, q) : variance;
 }
 
-int tells(const covariance *c, real S) { return S > 0 && root(c->owed->bound) <= LARGEST * root(S); }
+int tells(const covariance *c, real S) { return S > 0 && root(c->owed->bound) <= anc_longest_step * root(S); }
 
 real downdate(covariance *c, real S)
 {

@@ -53,10 +53,10 @@ static void measure(diagonal *f, const lines *rows, int32_t k, const real *d, re
     const int32_t n = s->J * s->I, L = s->L;
     const real inverse = look(f, rows, k, r), size = root(dot(f->direction, f->direction, n * L));
     /* Without measurement noise, a reference that is silent, or nearly so, carries no information. */
-    if (!within(inverse * size, LARGEST)) return;
+    if (!within(inverse * size, anc_longest_step)) return;
     for (int32_t scenario = 0; scenario < s->S; scenario++) {
         const real step = inverse * ((d ? d[scenario * s->K + k] : 0) - heard_output(s, rows, scenario, k));
-        if (within(step * size, LARGEST)) add_scaled(weights_of(s, scenario * s->J), step, f->direction, n * L);
+        if (within(step * size, anc_longest_step)) add_scaled(weights_of(s, scenario * s->J), step, f->direction, n * L);
     }
     for (int32_t ji = 0; ji < n; ji++) {
         const real *x = newest(rows, k * n + ji), *g = f->direction + times(ji, L);

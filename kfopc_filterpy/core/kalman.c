@@ -53,7 +53,7 @@ static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
         real *w = weights_of(&f->s, scenario * f->s.J);
         const real y = (z ? z[scenario * K + k] : 0) - dot(f->c.h, w, f->c.n);
         if (z) f->innovation[scenario * K + k] = y, f->variance[k] = S;
-        if (tell) correct(&f->c, w, y, inverse_root, LARGEST);
+        if (tell) correct(&f->c, w, y, inverse_root, anc_longest_step);
     }
 }
 

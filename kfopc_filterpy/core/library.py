@@ -83,6 +83,12 @@ def at_cache_line(n_bytes: int) -> NDArray[np.uint8]:
     return room[-room.ctypes.data % LINE :][:n_bytes]
 
 
+def constant(name: str, real: str = "double") -> float:
+    """Return the constant `anc_<name>` of anc.h."""
+    kind = ctypes.c_float if real == "float" else ctypes.c_double
+    return kind.in_dll(load(real).held, f"anc_{name}").value
+
+
 @functools.cache
 def load(real: str = "double") -> Library:
     """Load the core's library for a type of numbers.

@@ -4,11 +4,11 @@
 #include "signals.h"
 
 static const real OVERSHOOT = (real)1.1; /* the gain rises towards this multiple of its aim and stops at the aim, so that it reaches 1 */
-static const real RESERVE = (real)0.02;  /* of the power: keeps a tone's gain constant even if the window holds no whole periods */
+const anc_real anc_limiter_reserve = (real)0.02; /* of the power: keeps a tone's gain constant even if the window holds no whole periods */
 #ifdef ANC_FLOAT
-static const real FLOOR = 1e-30f; /* of the budget: keeps estimates above denormal numbers, which are slow */
+const anc_real anc_limiter_floor = 1e-30f; /* of the budget: keeps estimates above denormal numbers, which are slow */
 #else
-static const real FLOOR = 1e-200;
+const anc_real anc_limiter_floor = 1e-200;
 #endif
 
 static real least(real a, real b) { return b < a ? b : a; }
@@ -23,16 +23,16 @@ typedef struct { real *laps_out, *laps_in, *squares; } rows;
  * as loud as the largest one known, unless the present window is louder already. */
 static real aim(anc_limiter *c, rows r, int32_t i, int32_t size)
 {
-    real known = (1 + RESERVE) * c->known, room = 1;
+    real known = (1 + anc_limiter_reserve) * c->known, room = 1;
     if (c->arrived + r.laps_in[i + 1] > known) known = (real)INFINITY;
     for (int32_t j = 0; j < (int32_t)c->spans; j++) {
         const int32_t h = (int32_t)c->horizon[j];
         const int32_t before = i >= h ? i - h : i - h + size + 1;
-        c->held[j] = largest(largest(c->held[j] * c->fade, c->arrived + r.laps_in[before]), FLOOR);
+        c->held[j] = largest(largest(c->held[j] * c->fade, c->arrived + r.laps_in[before]), anc_limiter_floor);
         const int32_t kept = i + h <= size ? i + h : i + h - size - 1; /* where the last N - h samples begin */
         const real coming = least(least(c->held[j], (real)h * c->loud), known - (c->arrived + r.laps_in[kept]));
         const real left = least(1 - (c->spent + r.laps_out[kept]), c->room[j]);
-        room = least(room, left / largest(coming, FLOOR));
+        room = least(room, left / largest(coming, anc_limiter_floor));
     }
     return root(largest(room, 0));
 }
@@ -58,7 +58,7 @@ real anc_limit(anc_limiter *c, real *laps, real u)
     const real wide = least(u < 0 ? -u : u, c->planned) * c->scale, energy = wide * wide;
     c->arrived += energy;
     r.laps_in[i] = -c->arrived;
-    c->average = largest(c->average + c->attack * (energy - c->average), FLOOR);
+    c->average = largest(c->average + c->attack * (energy - c->average), anc_limiter_floor);
     c->loud = largest(c->loud * c->calm, c->average);
     const real wanted_gain = aim(c, r, i, size);
     c->gain = least(wanted_gain, c->gain + c->release * largest(OVERSHOOT * wanted_gain - c->gain, 0));

@@ -3,6 +3,16 @@
 
 enum { ALIGN = 64, SLACK = 64 };
 
+/* With these, no square overflows, and no weight or control signal can within 10^40 samples (10^5 in float). CALM: up to it,
+ * a factor of the reference in a step is not looked at, for CALM times the loudest reference is no long step. */
+#ifdef ANC_FLOAT
+const anc_real anc_loudest = 1e12f, anc_loudest_reference = 1e6f, anc_loudest_learnt = 1e6f, anc_longest_step = 1e6f;
+static const real CALM = 1;
+#else
+const anc_real anc_loudest = 1e100, anc_loudest_reference = 1e25, anc_loudest_learnt = 1e20, anc_longest_step = 1e50;
+static const real CALM = 1e20;
+#endif
+
 /* Layout. */
 
 /* Give the next field its place in the block, and return it; NULL while the block is only measured. */
@@ -95,8 +105,8 @@ static void set_loudest(signals *s)
         if (sum > reach) reach = sum;
     }
     for (int32_t g = 0; g < s->G; g++) guard += (real)fabs(s->guard[g]);
-    *s->loudest = s->filtered.rows ? LOUDEST_REFERENCE / reach / guard : LOUDEST;
-    if (s->modelled && *s->loudest > LOUDEST_LEARNT) *s->loudest = LOUDEST_LEARNT;
+    *s->loudest = s->filtered.rows ? anc_loudest_reference / reach / guard : anc_loudest;
+    if (s->modelled && *s->loudest > anc_loudest_learnt) *s->loudest = anc_loudest_learnt;
 }
 
 void start_signals(signals *s, const anc_plan *p, const anc_setting *settings)
@@ -196,10 +206,10 @@ real energy_of(const signals *s, const lines *rows, int32_t first, int32_t count
 static int estimate_at(const signals *s, const real *error, int32_t scenario, int32_t k, real *estimated)
 {
     real d = error[scenario * s->K + k];
-    if (!within(d, LOUDEST)) return ANC_LOUD_ERROR;
+    if (!within(d, anc_loudest)) return ANC_LOUD_ERROR;
     for (int32_t j = 0; j < s->J; j++) d += dot(s->path + times(k * s->J + j, s->M), newest(&s->y, scenario * s->J + j), s->M);
     *estimated = d;
-    return within(d, s->modelled ? *s->loudest : LOUDEST) ? ANC_DONE : ANC_LOUD_ESTIMATE;
+    return within(d, s->modelled ? *s->loudest : anc_loudest) ? ANC_DONE : ANC_LOUD_ESTIMATE;
 }
 
 static void keep_modelled(signals *s)
@@ -300,8 +310,8 @@ static int bound_steps(signals *s, const real *error)
         if (step[MU] * energy > 1) step[MU] = 1 / energy;
         if (x2 > 0) step[PENALTY] = bounded(step[PENALTY], (real)fabs(s->control[sj]) / x2);
         for (int32_t sk = sj / s->J * s->K; sk < (sj / s->J + 1) * s->K; sk++)
-            if (!within(step[MU] * error[sk] * size, LARGEST) || !within(step[MU] * s->heard[sk] * size, LARGEST)) return 0;
-        if (!within(step[PENALTY] * root(x2), LARGEST)) return 0;
+            if (!within(step[MU] * error[sk] * size, anc_longest_step) || !within(step[MU] * s->heard[sk] * size, anc_longest_step)) return 0;
+        if (!within(step[PENALTY] * root(x2), anc_longest_step)) return 0;
     }
     return 1;
 }

@@ -36,8 +36,9 @@ def joined(paths: list[Path]) -> str:
         text = path.read_text(encoding="utf-8")
         if path.suffix == ".h":
             text = re.sub(r"^extern ANC_PUBLIC const anc_algorithm [^;]*;\n", "", text, flags=re.M)
+            text = re.sub(r"^extern ANC_PUBLIC (?=const anc_real )", "static ", text, flags=re.M)
             text = re.sub(r"^(?=(?:void|int|real|int32_t) [^;{}]*\([^;{}]*\);)", "static ", text, flags=re.M)
-        text = re.sub(r"^const anc_algorithm ", "static const anc_algorithm ", text, flags=re.M)
+        text = re.sub(r"^(?=const anc_(?:algorithm|real) )", "static ", text, flags=re.M)
         text = re.sub(r'^#include "(.*)"\n', lambda found: text_of(FOLDER / found[1]), text, flags=re.M)
         return f"\n/* ---- {path.name} ---- */\n\n{text}"
 

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.block import Algorithm, Block
+from ..core.library import constant
 from ..power.limiter import NUMBERS, spans_of
 
 REALS = {np.dtype(np.float64): "double", np.dtype(np.float32): "float"}  # C's names
 LARGEST_MARGIN = 0.01  # of the rated power, which the limiter keeps free for rounding
-SINGLE_FLOOR = 1e-30  # of the budget, as in limiter.c
 
 
 def in_precision(block: Block, precision: np.dtype) -> Block:
@@ -74,4 +74,4 @@ def _convert_limiter(numbers: np.ndarray, precision: np.dtype) -> None:
     numbers["peak"] = (1.0 - 4.0 * epsilon) / numbers["scale"]
     numbers["budget"] = 1.0 - margin
     for values in (numbers["average"], numbers["loud"], spans_of(numbers)[1:, :spans]):  # held and room
-        np.maximum(values, SINGLE_FLOOR, out=values)
+        np.maximum(values, constant("limiter_floor", "float"), out=values)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._types import NumberOrArray
-from ..core.block import REASONS
+from ..core.block import reasons
 from .c99 import exportable
 from .precision import in_precision
 
@@ -74,5 +74,4 @@ class Float32Controller:
 
     def _require(self, answer: int) -> None:
         if answer:
-            limits = "in float32: 1e6 for 1e25 and 1e50, 1e12 for 1e100"
-            raise ValueError(f"{REASONS[answer]} ({limits}); nothing was changed")
+            raise ValueError(f"{reasons('float')[answer]}; nothing was changed")

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 from .._types import ChangingPaths, PerLoudspeaker, Seed
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
 from ..controllers.base import Controller, Looped, checked_controller, differing_counts, listening
-from ..controllers.block import LOUDEST_ERROR, runs_in_blocks
-from ..controllers.channel_samples import LOUDEST
+from ..controllers.block import runs_in_blocks
 from ..controllers.channels import Channels
 from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..controllers.processing import takes_none
+from ..core.block import LOUDEST, LOUDEST_LEARNT
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
 from ..paths.models import path_taps, sampling_rate
 from ..paths.path_matrix import feedback_paths, is_path_matrix, secondary_paths
@@ -317,7 +317,7 @@ class _Run:
         """Do what `steps` does for a controller that keeps its control filter for a block, in stretches within its blocks."""
         begin, changes, n_samples, limit = 0, 0, x.shape[1], self.plant.limit[:, None]
         # The first sample that the controller refuses begins a stretch, so that those before it are run.
-        loud = np.any(np.abs(x) > LOUDEST, axis=0) | np.any(np.abs(self.signals.disturbance) > LOUDEST_ERROR, axis=0)
+        loud = np.any(np.abs(x) > LOUDEST_LEARNT, axis=0) | np.any(np.abs(self.signals.disturbance) > LOUDEST, axis=0)
         refused = int(np.argmax(loud)) if loud.any() else n_samples
         while begin < n_samples:
             if begin == changes:

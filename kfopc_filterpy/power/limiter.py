@@ -16,16 +16,16 @@ from numpy.typing import ArrayLike
 
 from .._validate import as_number, as_positive, as_signal
 from ..core.calls import limit, limit_all
+from ..core.library import constant
 from .constraint import DEFAULT_FS
 
 DEFAULT_WINDOW_S = 0.1
 LONGEST_WINDOW = 10**7  # samples; the margin for rounding is then 2e-9 of the budget
 # Found by a search over tones, noises, bursts and level jumps for the least mean (u - y)^2 with little distortion.
 HORIZONS = 16  # future spans that the gain is planned for, evenly spaced up to N
-RESERVE = 0.02  # of the power; keeps a tone's gain constant even if the window does not hold whole periods
+RESERVE, FLOOR = constant("limiter_reserve"), constant("limiter_floor")  # of the budget, see limiter.c
 MEAN_TIME, LOUD_TIME, RELEASE_TIME, MEMORY = 1 / 40, 1 / 5, 1 / 8, 20.0  # time constants in windows
 LOUDEST = 100.0  # times the largest output: louder input is planned for as if it were this loud, to be forgotten soon
-FLOOR = 1e-200  # of the budget: keeps estimates above denormal numbers, which are slow
 
 
 _SETTINGS = ("scale", "peak", "budget", "limit", "planned", "attack", "calm", "fade", "release", "size", "spans")

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
+from ..core.block import LOUDEST
+
 GOOD, NOT_FINITE, CLIPPED, STUCK, OFFSET, REPEATED = range(6)
 KINDS = ("good", "not finite", "clipped", "stuck", "offset", "repeated")
-LARGEST = 1e100  # a larger value is no sound, and its square may overflow
+LARGEST = LOUDEST  # a larger value is no sound, and its square may overflow
 OFFSET_SHARE = 0.5  # of the power: a microphone has no offset, and a low tone a far smaller one
 LEAST_OFFSET = 0.01  # of full scale: converters have a small offset, which shows in silence
 

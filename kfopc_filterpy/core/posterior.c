@@ -1,4 +1,4 @@
-#include "plant.h"
+#include "posterior.h"
 #include <string.h>
 
 static const real UNKNOWN = 4;                          /* after an alarm: rms error of a secondary path, over the path */
@@ -44,24 +44,24 @@ void correlate(real *restrict to, const real *restrict a, int32_t n, const real 
 static int32_t whole(int32_t n) { return (n + PARTS - 1) / PARTS * PARTS; }
 
 /* G is the lower triangle, one row after the other, in groups of PARTS rows that all end with the group's last column. */
-static real *row_of_data(const plant *f, int32_t i)
+static real *row_of_data(const posterior *f, int32_t i)
 {
     const int32_t group = i / PARTS;
     return f->G + times(group, group + 1) * (PARTS * PARTS / 2) + times(i % PARTS, group + 1) * PARTS;
 }
 
 /* The factor has the same groups, each with its columns one after the other: a panel. */
-static real *panel_of(const plant *f, int32_t group) { return f->factor + times(group, group + 1) * (PARTS * PARTS / 2); }
+static real *panel_of(const posterior *f, int32_t group) { return f->factor + times(group, group + 1) * (PARTS * PARTS / 2); }
 
-void layout_posterior(plant *f, const signals *s, int32_t block, int exact, anc_layout *at)
+void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, anc_layout *at)
 {
     const int32_t K = s->K, J = s->J, I = s->I, M = s->M, N = s->L + M - 1, n = I * N + (exact ? 0 : J * M);
     const int32_t groups = whole(n) / PARTS;
     f->K = K, f->J = J, f->I = I, f->N = N, f->M = M, f->B = block, f->n = n, f->padded = whole(n), f->exact = exact;
     f->history = s->L + N + block, f->delay = (int32_t)((double)n * n * n / 3 / WORK), f->width = 3 * N + block;
     f->path = s->path;
-    f->numbers = (plant_numbers *)reals(at, "plant", ANC_STATE, 1, 1, 1, COLUMNS(plant_numbers));
-    f->counts = int32s(at, "plant_counts", ANC_STATE, PLANT_COUNTS);
+    f->numbers = (posterior_numbers *)reals(at, "posterior", ANC_STATE, 1, 1, 1, COLUMNS(posterior_numbers));
+    f->counts = int32s(at, "posterior_counts", ANC_STATE, POSTERIOR_COUNTS);
     f->fits = int32s(at, "fits", ANC_STATE, 1);
     f->alarms = int32s(at, "alarms", ANC_STATE, 1);
     f->z = reals(at, "history", ANC_STATE, 1, 1, I + J, f->history);
@@ -80,17 +80,17 @@ void layout_posterior(plant *f, const signals *s, int32_t block, int exact, anc_
     f->ss = reals(at, "path_correlation", ANC_STATE, 1, J, J, 2 * M - 1);
     f->ps = reals(at, "cross_correlation", ANC_STATE, 1, I, J, N + M - 1);
     f->sides = reals(at, "right_sides", ANC_SCRATCH, 1, 1, f->padded + J * M, PARTS);
-    f->work = reals(at, "plant_work", ANC_SCRATCH, 1, 1, PLANT_ROWS, f->width);
+    f->work = reals(at, "posterior_work", ANC_SCRATCH, 1, 1, POSTERIOR_ROWS, f->width);
 }
 
-static void return_to_prior(plant *f)
+static void return_to_prior(posterior *f)
 {
     const int32_t split = f->I * f->N, taps = f->n - split;
     for (int32_t k = 0; taps && k < f->K; k++)
         memcpy(f->theta + times(k, f->n) + split, f->path + times(k, taps), sizeof(real) * (size_t)taps);
 }
 
-void start_posterior(plant *f, real spread)
+void start_posterior(posterior *f, real spread)
 {
     f->numbers->spread = spread;
     f->counts[RANDOM] = 1;
@@ -98,7 +98,7 @@ void start_posterior(plant *f, real spread)
 }
 
 /* Return the mean of sum_m s(m)^2 over the secondary paths. */
-static real size_of_path(const plant *f)
+static real size_of_path(const posterior *f)
 {
     const int32_t paths = f->K * f->J;
     real sum = 0;
@@ -106,28 +106,28 @@ static real size_of_path(const plant *f)
     return sum / (real)paths;
 }
 
-static real mean_noise(const plant *f)
+static real mean_noise(const posterior *f)
 {
     real sum = 0;
     for (int32_t k = 0; k < f->K; k++) sum += f->q[k];
     return sum / (real)f->K;
 }
 
-static real *work_of(const plant *f, int32_t row) { return f->work + times(row, f->width); }
+static real *work_of(const posterior *f, int32_t row) { return f->work + times(row, f->width); }
 
 /* A fit: theta = (G + q P)^-1 (r + q P mean), with the precision P of the prior. */
 
 /* Return the precision of element i. */
-static real precision_of(const plant *f, int32_t i, real size)
+static real precision_of(const posterior *f, int32_t i, real size)
 {
     return i < f->I * f->N ? f->numbers->prior : (real)f->M / (f->numbers->spread * f->numbers->spread * size);
 }
 
 /* Set aside the present data for a factorisation. */
-static void begin_fit(plant *f)
+static void begin_fit(posterior *f)
 {
     const int32_t split = f->I * f->N, n = f->n;
-    plant_numbers *known = f->numbers;
+    posterior_numbers *known = f->numbers;
     if (known->prior == 0) { /* |p|^2 is expected to be E[d^2] / E[x^2] */
         real x2 = 0, e2 = 0;
         for (int32_t i = 0; i < split; i++) x2 += row_of_data(f, i)[i];
@@ -176,7 +176,7 @@ static void eliminate(real *restrict X, const real *restrict S, const real *rest
 }
 
 /* Factorise the next group of rows; return 0 if the matrix is not positive definite. */
-static int factorise_group(plant *f, int32_t group, real q, real size)
+static int factorise_group(posterior *f, int32_t group, real q, real size)
 {
     real S[PARTS * PARTS], *panel = panel_of(f, group);
     for (int i = 0; i < PARTS; i++) {
@@ -201,7 +201,7 @@ static int factorise_group(plant *f, int32_t group, real q, real size)
 }
 
 /* Solve C Z = Z for PARTS right sides. */
-static void solve_forward(const plant *f, real *Z)
+static void solve_forward(const posterior *f, real *Z)
 {
     real S[PARTS * PARTS];
     for (int32_t group = 0; group < f->padded / PARTS; group++) {
@@ -216,7 +216,7 @@ static void solve_forward(const plant *f, real *Z)
 }
 
 /* Solve C' Z = Z. */
-static void solve_backward(const plant *f, real *Z)
+static void solve_backward(const posterior *f, real *Z)
 {
     for (int32_t group = f->padded / PARTS - 1; group >= 0; group--) {
         const real *panel = panel_of(f, group), *C = panel + PARTS * PARTS * group;
@@ -247,7 +247,7 @@ static real sign_of(int32_t *random)
 }
 
 /* Solve for the means of up to PARTS microphones from `first` on, and set their noise. */
-static int solve_means(plant *f, int32_t first, real q, real size)
+static int solve_means(posterior *f, int32_t first, real q, real size)
 {
     const int32_t n = f->n, split = f->I * f->N, most = f->K - first < PARTS ? f->K - first : PARTS;
     real *Z = f->sides;
@@ -277,7 +277,7 @@ static int solve_means(plant *f, int32_t first, real q, real size)
 }
 
 /* The factor is complete: solve for the posterior. */
-static void end_fit(plant *f, real q, real size)
+static void end_fit(posterior *f, real q, real size)
 {
     for (int32_t first = 0; first < f->K; first += PARTS)
         if (!solve_means(f, first, q, size)) return;
@@ -295,7 +295,7 @@ static void end_fit(plant *f, real q, real size)
 }
 
 /* Do this block's part of the factorisation; every block does about as much. */
-static void go_on_fitting(plant *f)
+static void go_on_fitting(posterior *f)
 {
     const real q = mean_noise(f), size = size_of_path(f);
     const double groups = f->padded / PARTS, blocks = f->delay + 1, done = blocks + 1 - f->counts[PENDING];
@@ -311,7 +311,7 @@ static void go_on_fitting(plant *f)
 
 /* A block. */
 
-int complete_sample(plant *f, const real *error)
+int complete_sample(posterior *f, const real *error)
 {
     const int32_t at = f->B - 1 - f->heard[FILLED];
     for (int32_t k = 0; error && k < f->K; k++) f->errors[times(k, f->B) + (size_t)at] = error[k];
@@ -319,14 +319,14 @@ int complete_sample(plant *f, const real *error)
     return ++f->heard[FILLED] == f->B;
 }
 
-void begin_block(plant *f)
+void begin_block(posterior *f)
 {
     f->heard[FILLED] = f->heard[MISSING] = 0;
     for (int32_t i = 0; i < f->I + f->J; i++) memmove(history_of(f, i) + f->B, history_of(f, i), sizeof(real) * (size_t)(f->history - f->B));
 }
 
 /* Set d to p * x and z to s * y of the block. */
-static void explain(const plant *f, const real *theta, real *d, real *z)
+static void explain(const posterior *f, const real *theta, real *d, real *z)
 {
     real *part = work_of(f, 0);
     memset(d, 0, sizeof(real) * (size_t)f->B), memset(z, 0, sizeof(real) * (size_t)f->B);
@@ -338,15 +338,15 @@ static void explain(const plant *f, const real *theta, real *d, real *z)
 }
 
 /* Data for the first fit after an alarm are collected for half as many blocks as a fit takes. */
-static int32_t collected(const plant *f) { return f->delay / 2 + 1; }
+static int32_t collected(const posterior *f) { return f->delay / 2 + 1; }
 
 /* Return the blocks from an alarm to the end of the first fit. */
-static int32_t first_fit(const plant *f) { return collected(f) + f->delay; }
+static int32_t first_fit(const posterior *f) { return collected(f) + f->delay; }
 
 /* Return whether the error is beyond its noise, the usual misfit of the model, and what is not known yet. If so, note the limit. */
-static int is_alarm(const plant *f, real unexplained, real d2, real q)
+static int is_alarm(const posterior *f, real unexplained, real d2, real q)
 {
-    const plant_numbers *known = f->numbers;
+    const posterior_numbers *known = f->numbers;
     if (f->counts[AGE] <= (*f->alarms ? QUIET + first_fit(f) : 1) || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
     const real limit = SURPRISE * q + larger(MISFIT, USUAL * root(known->misfit / known->seen)) * d2;
     if (unexplained <= limit) return 0;
@@ -362,7 +362,7 @@ static int is_alarm(const plant *f, real unexplained, real d2, real q)
 }
 
 /* Return whether no secondary path explains the errors after an alarm: then the primary paths have changed. */
-static int is_wrong(plant *f, real unexplained)
+static int is_wrong(posterior *f, real unexplained)
 {
     const int32_t fitted_for = f->counts[AGE] - first_fit(f);
     if (f->exact || !(f->numbers->limit > 0) || fitted_for < FROM || fitted_for > TO) return 0;
@@ -372,10 +372,10 @@ static int is_wrong(plant *f, real unexplained)
 
 /* Begin anew after a change: the secondary paths return to their prior; of the data of the primary paths, some samples per tap
  * are kept. */
-static void begin_anew(plant *f, real samples)
+static void begin_anew(posterior *f, real samples)
 {
     const int32_t n = f->n, split = f->I * f->N;
-    plant_numbers *known = f->numbers;
+    posterior_numbers *known = f->numbers;
     const real kept = samples * (real)n < known->samples ? samples * (real)n / known->samples : 1;
     for (int32_t k = 0; k < f->K; k++) {
         real *r = f->r + times(k, n);
@@ -405,7 +405,7 @@ static void begin_anew(plant *f, real samples)
 
 /* Let the part of G that is sum v(t - i) u(t - c), i < n, c < m, fade and take a block: along the diagonals of the sums, the
  * window of t moves by one sample. On the diagonal of G, v is u. */
-static void add_products(plant *f, const real *v, int32_t at_v, int32_t n, const real *u, int32_t at_u, int32_t m, real sign, real forget)
+static void add_products(posterior *f, const real *v, int32_t at_v, int32_t n, const real *u, int32_t at_u, int32_t m, real sign, real forget)
 {
     const int32_t B = f->B;
     real *column = work_of(f, 2), *last = work_of(f, 3), *next = work_of(f, 4);
@@ -429,7 +429,7 @@ static void add_products(plant *f, const real *v, int32_t at_v, int32_t n, const
 }
 
 /* Add the block to the data. */
-static void add_block(plant *f, real forget)
+static void add_block(posterior *f, real forget)
 {
     const int32_t regressors = f->I + (f->exact ? 0 : f->J), B = f->B;
     real *sums = work_of(f, 1);
@@ -453,13 +453,13 @@ static void add_block(plant *f, real forget)
 }
 
 /* Learn from a block whose errors are all known; at least as many samples as a primary path has taps have been heard. */
-static void learn_heard(plant *f, real forget)
+static void learn_heard(posterior *f, real forget)
 {
     const int32_t B = f->B;
     const real samples = (real)B * (real)f->K, q = mean_noise(f);
     const int known = (real)f->heard[HEARD] / (real)B * (1 - forget) >= KNOWN;
     real *part = work_of(f, 0), *d = work_of(f, 1), *z = work_of(f, 2), unexplained = 0, d2 = 0;
-    plant_numbers *numbers = f->numbers;
+    posterior_numbers *numbers = f->numbers;
     for (int32_t k = 0; k < f->K; k++) {
         real *error = f->errors + times(k, B);
         for (int32_t j = 0; f->exact && j < f->J; j++) /* s^ is exact: what is played teaches nothing */
@@ -496,7 +496,7 @@ static void learn_heard(plant *f, real forget)
     if (f->counts[PENDING]) go_on_fitting(f);
 }
 
-void learn(plant *f, real forget)
+void learn(posterior *f, real forget)
 {
     if (!f->heard[MISSING] && f->heard[HEARD] >= f->N) learn_heard(f, forget);
     if (f->heard[HEARD] < 1 << 30) f->heard[HEARD] += f->B;
@@ -517,7 +517,7 @@ static void reverse(real *restrict to, const real *restrict a, int32_t n)
 }
 
 /* Add the weighted correlations of one theta. */
-static void expect_also(plant *f, const real *theta, real weight)
+static void expect_also(posterior *f, const real *theta, real weight)
 {
     const int32_t I = f->I, J = f->J, N = f->N, M = f->M;
     const real *s = theta + times(I, N);
@@ -538,7 +538,7 @@ static void expect_also(plant *f, const real *theta, real weight)
     }
 }
 
-void expect(plant *f)
+void expect(posterior *f)
 {
     const int32_t I = f->I, J = f->J, N = f->N, M = f->M, lags = 2 * M - 1;
     memset(f->ss, 0, sizeof(real) * times(J * J, lags));
