@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.checkpoints import Room
 from helpers.controllers import ALL
+from helpers.rooms import Room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.channels import random_paths
-from helpers.checkpoints import Room
 from helpers.comparing import assert_same_run, numbers_of
 from helpers.controllers import ALL, IN_BLOCKS, PATHS, SEVERAL, VARIANTS, I, J, K, made
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, N_TAPS, run
+from helpers.rooms import Room
 
 from kfopc_filterpy import HardClipAmplifier, simulate
 
