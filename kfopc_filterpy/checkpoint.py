@@ -5,8 +5,8 @@ A file is an archive of numpy's (``.npz``). It has the arrays of the object, eac
 bytes before it.
 
 An object in the header is the name of its class, and what ``__getstate__`` returns, for a copy and a file alike. What an
-object holds twice is still one thing. Only the package's own classes, and those that the caller of `load` passes, can be
-named; nothing else that a file names is looked up, and nothing in a file is code.
+object holds twice is still one thing. Only the package's own classes, filterpy's `KalmanFilter` and those that the caller
+of `load` passes can be named, and nothing in a file is code.
 """
 
 from __future__ import annotations

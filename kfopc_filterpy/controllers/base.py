@@ -26,7 +26,8 @@ class Controller(Protocol):
     Optional attributes: `constraint_factor`, `disturbance_power` and `secondary_path_gain` are recorded if present, and
     `weights`, (L,), if requested. `name` names the result. `listen(references, errors)` follows the noise before the
     control is switched on. If a controller has `n_references`, `n_loudspeakers` or `n_microphones`, a run with other numbers
-    of channels is refused before it begins; otherwise the first sample shows the mismatch.
+    of channels is refused before it begins; otherwise the first sample shows the mismatch. `state()` and `restore(state)`
+    let `save` and `load` of a wrapper or a supervisor include it.
     """
 
     def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
