@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -74,7 +73,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prepare_folder(options.output)
     except OSError as error:
         parser.error(str(error))
-    began = time.perf_counter()
     reports: list[StudyReport] = []
     left_out: list[str] = []
     chosen = {name: (STUDIES | FURTHER)[name] for name in options.studies or STUDIES}
@@ -95,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     reports[-1].notes.extend(left_out)  # the page would not show otherwise that something is missing
     page = write_report(reports, options.output)
     print(results_table(reports))
-    print(f"\n{page}, with notes and all tables, and results.json written in {time.perf_counter() - began:.0f} s")
+    print(f"\n{page}, with notes and all tables, and results.json written")
     return 0
 
 

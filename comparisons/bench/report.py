@@ -15,7 +15,7 @@ from kfopc_filterpy.verdict.page import images, players, rendered
 
 from .descriptions import DESCRIPTIONS
 from .merit import MERITS
-from .study_report import StudyReport, claims_sentence, require_different
+from .study_report import Claim, StudyReport, claims_sentence, require_different
 
 SCREEN_ROWS = 30  # of a table that fits a screen
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
@@ -120,9 +120,7 @@ def results_table(studies: Sequence[StudyReport]) -> str:
     >>> print(results_table([study]))
     tonal: A tone
     <BLANKLINE>
-    Claims
-           measured  holds if      claim                                     note
-    holds    0.9999  at most 1.02  KF-OPC's output power over the rated one
+    holds     0.9999  at most 1.02    KF-OPC's output power over the rated one
     <BLANKLINE>
     Figures of merit
     algorithm  noise reduction (dB)  output power  of the rated power
@@ -133,7 +131,16 @@ def results_table(studies: Sequence[StudyReport]) -> str:
     lines = []
     for study in studies:
         lines += [f"{study.name}: {study.title}", ""]
+        lines += [line for claim in study.claims for line in _told(claim)]
+        lines += [""] if study.claims else []
         for table in study.all_tables:
-            if len(table.rows) <= SCREEN_ROWS:
+            if table.stem != "claims" and len(table.rows) <= SCREEN_ROWS:
                 lines += [*textwrap.wrap(table.caption, 116), *table.lines, ""]
     return "\n".join([*lines, claims_sentence(studies)]).rstrip()
+
+
+def _told(claim: Claim) -> list[str]:
+    """Return a claim as lines: whether it holds, what was measured, the limits, and the text."""
+    begins = f"{'holds' if claim.holds else 'fails'} {claim.value:10.4g}  {claim.limits:<14}  "
+    text = f"{claim.text} ({claim.note})" if claim.note else claim.text
+    return textwrap.wrap(text, 116, initial_indent=begins, subsequent_indent=" " * len(begins))

@@ -14,6 +14,7 @@ from kfopc_filterpy.metrics import peak_control_signal
 from ..bench import Claim, Runs, Scene, Table, Tuned
 from .cases import Results, run_seeds
 from .report_parts import first_second_db
+from .rows import span
 
 KNOWING = "KF-OPC, known amplifier"
 UNAWARE = "KF-OPC, q without the clipping"
@@ -72,6 +73,6 @@ def starts_table(clipped: Mapping[str, Mapping[str, Any]]) -> Table:
     return Table(
         "clipped",
         "The amplifier clips: noise reduction and control signal, least and most of all seeds",
-        ["algorithm", *(f"{heading}, {which}" for heading in shown.values() for which in ("least", "most"))],
-        [[name, *(float(end(own[key])) for key in shown for end in (np.min, np.max))] for name, own in clipped.items()],
+        ["algorithm", *shown.values()],
+        [[name, *(span(own[key]) for key in shown)] for name, own in clipped.items()],
     )
