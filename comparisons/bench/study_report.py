@@ -164,12 +164,13 @@ def claims_sentence(studies: Sequence[StudyReport]) -> str:
     >>> kept, over = Claim("Output power", 1.0, at_most=1.02), Claim("Output power", 1.7, at_most=1.02)
     >>> claims_sentence([StudyReport(name, name, "", 16000, 1.0, {}, claims=[kept, own])
     ...                  for name, own in (("a", kept), ("b", over))])
-    '3 of 4 claims hold; 1 of b fails'
+    '3 of 4 claims hold; failing: 1 of b'
     """
     failed = {study.name: sum(not claim.holds for claim in study.claims) for study in studies}
     total = sum(len(study.claims) for study in studies)
-    others = "".join(f"; {count} of {name} fails" for name, count in failed.items() if count)
-    return f"{total - sum(failed.values())} of {total} claims hold{others}" if total else ""
+    others = ", ".join(f"{count} of {name}" for name, count in failed.items() if count)
+    holding = f"{total - sum(failed.values())} of {total} claims hold" if total else ""
+    return f"{holding}; failing: {others}" if others else holding
 
 
 def require_different(names: Iterable[str], what: str) -> None:

@@ -16,7 +16,7 @@ from .. import bench
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
 from . import report_parts as parts
 from .cases import BAND_HZ, FS, Case, Pair, driven_case, ducts, grid_runs, grids, noise_of
-from .rows import Row, column, figure_table, select, worst_claim
+from .rows import Row, column, figure_table, grouped, select, span, worst_claim
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB", "FxRLS", "FxLMS", "MOV-FxLMS", "optimal leaky FxLMS")
 UNCONSTRAINED = ("KF-ANC", "FxRLS", "FxLMS")
@@ -102,6 +102,7 @@ def main(runs: Runs) -> StudyReport:
             parts.ceilings_note(scenes),
         ],
         tables=[
+            summary_table(rows),
             _table(rows, "exact", "Noise reduction over the steady half in dB", EXACT, "noise_reduction_db"),
             _table(rows, "wrong", "Noise reduction over the steady half in dB", WRONG, "noise_reduction_db"),
             _table(rows, "power", "Output power over the rated one", EXACT, "power"),
@@ -200,6 +201,24 @@ def claims(rows: Sequence[MismatchRow]) -> list[Claim]:
 
 
 # ---- Tables and figures
+
+
+def summary_table(rows: Sequence[MismatchRow]) -> Table:
+    """Return what all mismatches together do to each algorithm, tuned with the exact path."""
+    lines: list[list[str | float]] = []
+    for (name,), own in grouped(select(rows, tuned_with=EXACT), "algorithm").items():
+        gains = select(own, kind="gain")
+        exact = {row.case: row.loss_db for row in gains if row.amount == 0.0}
+        lost = np.max([row.loss_db - exact[row.case] for row in gains])
+        away = sum(row.diverged_at_s is not None for row in own)
+        lines.append([name, len(own), away, lost, span([row.power for row in gains if row.diverged_at_s is None])])
+    return Table(
+        "summary",
+        "Tuned with the exact path: runs that diverge; with a wrong gain, noise reduction lost at most and output power over the "
+        "rated one",
+        ["algorithm", "runs", "diverged", "lost (dB)", "power"],
+        lines,
+    )
 
 
 def _table(rows: Sequence[MismatchRow], stem: str, caption: str, tuned_with: str, figure: str) -> Table:

@@ -326,4 +326,4 @@ def test_the_terminal_shows_claims_figures_of_merit_and_what_fits_a_screen():
     assert [caption for caption in (long.caption, POWERS.caption, EMPTY.caption) if caption in lines] == [
         POWERS.caption
     ]
-    assert lines[-1] == "1 of 2 claims hold; 1 of tonal fails"
+    assert lines[-1] == "1 of 2 claims hold; failing: 1 of tonal"
