@@ -164,7 +164,7 @@ def test_a_controller_refuses_and_goes_on_or_gives_finite_numbers(name: str) -> 
             # Without a limiter, weights of 1e200 or a reference of 1e300 are allowed; only then an output can overflow.
             if y is not None and float(weights) * largest < 1e300:
                 assert np.all(np.isfinite(y)), (method, given)
-            # CONTRIBUTING names it: the products of an LMS step can overflow. Until then, weights are finite.
+            # The products of an LMS step can overflow. Until then, weights are finite.
             assert np.all(np.isfinite(controller.weights)) or largest * loudest > 1e300, (method, given)
 
 

@@ -1,1 +1,0 @@
-"""Exported controllers on an emulated microcontroller."""

@@ -1,1 +1,0 @@
-"""The soak: controllers that run for very long."""
