@@ -24,8 +24,6 @@ def _study(module: str, main: str = "main") -> Study:
 ALONE = {  # with options of their own
     "speed": ".speed.study",
     "sweep": ".sweep.study",
-    "soak": ".soak.study",
-    "board": ".board.study",
     "benchmark": ".benchmark.study",
     "data": ".bench.measured",
 }
@@ -50,9 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="*",
         metavar="STUDY",
         help=f"{', '.join(STUDIES)}, by default all of these; beyond the paper: {', '.join(FURTHER)}; "
-        "speed, which times the filter beside others; board, which runs exported controllers on an emulated microcontroller; "
-        "sweep, which runs a grid; soak, which runs controllers for very long; benchmark, which scores them and others "
-        "on the same tasks; or data, which fetches the measured data; these have options of their own (sweep --help)",
+        "sweep, which runs a grid; speed, which times the filter beside others; benchmark, which scores controllers and "
+        "others on the same tasks; or data, which fetches the measured data; these have options of their own (sweep --help)",
     )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
