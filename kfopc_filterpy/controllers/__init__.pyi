@@ -9,7 +9,5 @@ from .power_budget import PowerBudgetController as PowerBudgetController
 from .processing import RefusedUpdate as RefusedUpdate
 from .subfilter import SubfilterKalman as SubfilterKalman
 from .subfilter import band_subfilters as band_subfilters
-from .verified import PathEvent as PathEvent
-from .verified import VerifiedController as VerifiedController
 from .virtual import KalmanObserver as KalmanObserver
 from .virtual import VirtualMicrophones as VirtualMicrophones

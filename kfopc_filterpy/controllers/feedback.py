@@ -26,7 +26,7 @@ class FeedbackNeutralizer(WrappedController):
     Parameters
     ----------
     controller : Controller
-        Any controller: a built-in one, a wrapped one such as a `VerifiedController`, or one of your own.
+        Any controller: a built-in one, a wrapped one, or one of your own.
     feedback_path : array_like, shape (taps,) or (I, J, taps), or control system
         Identified path from the loudspeaker to the reference microphone, or those from J loudspeakers to I reference
         microphones, see `paths.estimate_path`. Its first tap must be 0: sound takes time.

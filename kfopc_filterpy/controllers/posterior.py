@@ -1,8 +1,7 @@
-"""Controllers that learn a posterior of the plant: KF-PB, and the observer beside another controller."""
+"""What KF-PB knows of the plant: the posterior of its paths."""
 
 from __future__ import annotations
 
-import math
 from typing import Any, ClassVar
 
 import numpy as np
@@ -94,43 +93,3 @@ class PosteriorController(CoreController):
         fresh = block.fresh(block.shape)
         for name in POSTERIOR:
             block.fields[name][:] = fresh.fields[name]
-
-
-class PathObserver(PosteriorController):
-    """The posterior alone. Its references are those of the controller, followed by what the loudspeakers play.
-
-    Parameters
-    ----------
-    n_taps : int
-        Taps L of the control filters.
-    secondary_path : ndarray, shape (K, J, M)
-        Estimated secondary paths.
-    n_references : int
-        Number of references I of the controller.
-    spread : float
-        Relative rms error of the estimate, above 0.
-    fs : float
-        Sample rate in Hz.
-    memory_s : float
-        Memory in seconds.
-    """
-
-    name = "path observer"
-    algorithm = "observer"
-
-    def __init__(
-        self, n_taps: int, secondary_path: np.ndarray, *, n_references: int, spread: float, fs: float, memory_s: float
-    ) -> None:
-        self.block = block_of(fs)
-        super().__init__(
-            n_taps,
-            secondary_path,
-            settings={"block": self.block, "window": math.exp(-2.0 / (memory_s * fs)), "spread": spread},
-            n_references=n_references + secondary_path.shape[1],
-            multichannel=True,
-        )
-
-    @property
-    def fits(self) -> int:
-        """Number of posteriors so far."""
-        return int(self._block.fields["fits"].item())

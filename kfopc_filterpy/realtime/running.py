@@ -463,15 +463,14 @@ def run(
 
     known = {"full_scale": None, "blocks_can_repeat": True}
     settings: dict[str, Any] = {name: getattr(interface, name, value) for name, value in known.items()} | supervision
-    supervised: Callable[[Any], Supervisor] = partial(
+    supervised: Callable[..., Supervisor] = partial(
         Supervisor, fs=interface.fs, amplitude_limit=amplitude_limit, **settings
     )
     supervisor = supervised(made)
     _require_fit(supervisor, interface)
     possible_db = _possible_db(silence, made, interface.fs) if check_causality else np.nan
-    _warm_up(supervised(deepcopy(made)), interface.block)
-    supervisor.start_silent()
-    supervisor.fade_in()
+    _warm_up(supervised(deepcopy(made), louder_s=None), interface.block)
+    supervisor.listen(silence.x, silence.e)
     watch = _Watch(session, supervisor, silence, report_every_s, on_report)
     with _open(interface):
         stopped_by = _control(session, supervisor, watch, seconds, should_stop)
@@ -492,10 +491,9 @@ def _warm_up(supervisor: Supervisor, block: int) -> None:
     """Process blocks with a copy of the controller, so that all that it uses is loaded before the first real one."""
     rng, shapes = np.random.default_rng(0), ((supervisor.n_references, block), (supervisor.n_microphones, block))
     signals = [1e-3 * rng.standard_normal(shape) for shape in shapes]
+    supervisor.listen(*signals)
     for _ in range(2 * max(WARM_UP // block, 1)):
         supervisor.process(*signals)
-    supervisor.start_silent()
-    supervisor.process(*signals)
 
 
 def _control(

@@ -20,22 +20,18 @@ from ..controllers.processing import RefusedUpdate, process_steps
 from ..paths.uncertainty import GUARD_TAPS
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
+from .adaptation import Adaptation
 from .faults import GOOD, KINDS, NOT_FINITE, REPEATED, STUCK, Inspector, is_repeated
 from .health import Health
+from .loudness import Loudness
 
 ACTIONS = ("mute", "reset", "freeze")
 LONGEST_PAUSE = 64  # of the first pause
-OVER_POWER = 4.0  # times the rated power over a window: no algorithm exceeds its rating so much after its first blocks
-PATIENCE = 3  # windows in a row that must be too loud: after a jump of the noise, the power needs some time
-OFTEN_LIMITED = 0.1  # of a window's samples at the limit
-SURPRISE = 1e4  # squared innovation over its predicted variance, relative to what is usual: 40 dB
-GROWN = 1.5  # times the last normal gain: a filter that is louder with the same gain hears louder noise
-OFTEN_REFUSED = 0.1  # of a window's samples
 MOST_REFUSALS = 3  # in a block; then the rest of it is not adapted to
 FORGOTTEN_S = 600.0  # without a divergence, after which the pauses are short again
-SETTLING_WINDOWS = 4  # before the usual surprise is known
 MOST_LOST = 2**53  # samples at once; many times as many are still a number that converts to a time
-USUAL_WINDOWS = 40.0  # over which it is averaged
+MOST_DB = 100.0  # of louder noise: the square of a ratio of powers is still a number
+ABSENT = (NOT_FINITE, STUCK, REPEATED)  # kinds of samples that say nothing of how loud it is
 
 
 class Supervisor(Checkpointed):
@@ -80,6 +76,12 @@ class Supervisor(Checkpointed):
         Time over which the divergence monitor averages, in seconds.
     largest_gain : float, default 1e6
         Largest sum of the magnitudes of a control filter's weights.
+    louder_db : float, default 2
+        How much louder than before control the noise may become, in dB.
+    louder_s : float, optional
+        Time over which that is averaged, in seconds, by default 1. With silent loudspeakers, the supervisor listens for
+        as long at the start, to know the level before control. None: the loudness is not watched, and the control
+        begins at once.
     blocks_can_repeat : bool, default True
         Whether a block that equals the last one in all channels is a fault of the driver. Switch it off for simulated
         noise whose period divides the block.
@@ -112,15 +114,18 @@ class Supervisor(Checkpointed):
     - in three windows in a row, a control signal of more than four times the controller's rated power, or one at its
       limit for a tenth of the time, from a control filter whose gain has grown;
     - updates that the controller refuses for a tenth of the samples;
-    - squared innovations 40 dB above what is usual or predicted, if the reference has not risen as much, for the
-      controllers around a Kalman filter (of the last sample of each block). The disturbances of an internal model
-      count as references.
+    - noise that is louder than before control, for example because a loudspeaker has the wrong polarity.
+
+    For the last one, it compares the power of the errors, the sum over the microphones, with that of the last silence. If
+    the references have become louder since then, as much more is expected. If the mean over `louder_s` is `louder_db`
+    above that, where each window counts at most twice as many dB, the loudspeakers fade out, and it listens for as long. If
+    the noise is now softer by at least half of `louder_db`, that was a divergence. Otherwise the noise itself has
+    become louder, and the same controller fades in again. Without a reference microphone, noise that becomes louder by
+    itself costs such a silence each time. The loudness is not watched with virtual microphones: it may rightly rise
+    where the microphones are.
 
     `save` and `load` include the controller, its copies, the fades and pauses under way, and the health record. Call
     `save` between two blocks.
-
-    It cannot see that the noise becomes louder in the room: put the controller into a `VerifiedController` for that, for
-    example for a microphone or a loudspeaker whose sign was flipped.
 
     Examples
     --------
@@ -152,6 +157,8 @@ class Supervisor(Checkpointed):
         pause_s: float = 2.0,
         window_s: float = 0.25,
         largest_gain: float = 1e6,
+        louder_db: float = 2.0,
+        louder_s: float | None = 1.0,
         blocks_can_repeat: bool = True,
     ) -> None:
         self._controller: Any = checked_controller(controller)
@@ -180,13 +187,25 @@ class Supervisor(Checkpointed):
         self._pause = self._first_pause = as_sample_count(pause_s, fs, "pause_s")
         self.blocks_can_repeat = blocks_can_repeat
         self.divergence_times_s: deque[float] = deque(maxlen=3)
+        n_windows = 1 if louder_s is None else round(as_sample_count(louder_s, fs, "louder_s") / self._window)
+        if as_positive(louder_db, "louder_db", unit="dB") > MOST_DB:
+            raise ValueError(
+                f"louder_db must be at most {MOST_DB:g} dB, got {louder_db:g}; louder_s=None never listens"
+            )
+        watched = louder_s is not None and not hasattr(controller, "physical")
+        self._loudness = Loudness(self._window, max(n_windows, 1), 10.0 ** (louder_db / 10.0) if watched else np.inf)
+        self._listening = watched  # with silent loudspeakers, to know how loud the noise is
+        self._suspected: np.ndarray | None = None  # windows that were louder than before control
         self._samples = 0  # since the start, lost ones included
-        self._gain = 1.0  # of the control signal
+        self._gain = 0.0 if watched else 1.0  # of the control signal
         self._wanted = True  # whether the user wants control
         self._waiting = 0  # samples left of a pause
         self._replacement_due = False  # a fresh controller takes over when the loudspeakers are silent
         self._frozen = 0  # samples left without adaptation
         self._since_bad_reference = self._since_fade = self.recovery_samples
+        self._dies_away = max(self.recovery_samples, self._fade)
+        self._silent_for = self._dies_away  # samples; nothing was played
+        self._watched = ""  # what the present window is: "silence", "control", or nothing
         self._unusable = 0  # samples since the last usable one
         self._paused_for_input = False
         self._last_y = np.zeros(self.n_loudspeakers)
@@ -196,9 +215,7 @@ class Supervisor(Checkpointed):
         self._wanted_y, self._played_y = np.zeros((2, self.n_loudspeakers, remembered))
         # State of the last good window, and what it wanted to play.
         self._good: Any = (self._fresh, self._wanted_y) if on_divergence == "freeze" else None
-        self._usual, self._usual_reference, self._normal_gain = np.nan, np.nan, np.inf
-        self._windows, self._loud_windows = 0, 0
-        self._begin_window()
+        self._adaptation = Adaptation(self.n_loudspeakers, self._window)
 
     @property
     def controller(self) -> Any:
@@ -242,7 +259,7 @@ class Supervisor(Checkpointed):
     @property
     def _target(self) -> float:
         """Gain that the control signal fades to."""
-        held_back = self._waiting > 0 or self._paused_for_input or self._replacement_due
+        held_back = self._waiting > 0 or self._paused_for_input or self._replacement_due or self._listening
         return 1.0 if self._wanted and not held_back else 0.0
 
     @property
@@ -251,7 +268,7 @@ class Supervisor(Checkpointed):
         return self._gain == 0.0 and self._target == 0.0
 
     def __repr__(self) -> str:
-        state = "muted" if self.muted else "frozen" if self._frozen else "running"
+        state = "listening" if self._listening else "muted" if self.muted else "frozen" if self._frozen else "running"
         return f"<Supervisor of {getattr(self.controller, 'name', type(self.controller).__name__)}: {state}, {self.health!r}>"
 
     def fade_in(self) -> None:
@@ -262,9 +279,32 @@ class Supervisor(Checkpointed):
         """Let the control fade out over `fade_s`; the controller listens while it is silent."""
         self._wanted = False
 
-    def start_silent(self) -> None:
-        """Begin with silent loudspeakers; `fade_in` starts the control."""
-        self._gain, self._wanted = 0.0, False
+    def listen(self, references: ArrayLike, errors: ArrayLike) -> None:
+        """Take a recording of the silence before the first block, in place of listening at the start; then fade in.
+
+        The controller hears it too, if it has `listen`.
+
+        Parameters
+        ----------
+        references, errors : array_like
+            Signals as for `process`, of at least `window_s`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            Signals of other shapes, or that are not numbers, or that come after the first block.
+        """
+        if self._samples:
+            raise ValueError("listen takes what was heard before the first block, but there were blocks already")
+        x, e = self._read(references, errors)
+        wanted, self._wanted, self._gain = self._wanted, False, 0.0
+        self._samples = -x.shape[1]
+        for begin in range(0, x.shape[1], self._window):
+            part = slice(begin, begin + self._window)
+            self._process(x[:, part], e[:, part])
+        self._wanted = wanted
+        self._listening = self._listening and self._loudness.before is None
+        self._since_bad_reference = 0  # what comes next does not follow it at once
 
     def note(self, what: str, n_samples: int = 1) -> None:
         """Record an event of the interface in `health`, at the present time.
@@ -310,9 +350,13 @@ class Supervisor(Checkpointed):
             self._note("lost", n_samples=lost)
             self._samples += lost
             self._since_bad_reference = 0
-        missing, usable = self._usable(x, e)
-        e, d = self._as_wanted(e, missing) if self._modelled else (e, e[:0])
-        wanted, y = self._control(x, e, usable)
+        y = self._process(x, e)
+        return y if self.multichannel else y[0]
+
+    def _process(self, x: np.ndarray, e: np.ndarray) -> np.ndarray:
+        """Return the control signals (J, n) of a block (I, n), (K, n), whose bad samples are replaced."""
+        absent, usable = self._inspect(x, e)
+        wanted, y = self._control(x, self._as_wanted(e, absent[len(x) :]) if self._modelled else e, usable)
         self._limit(y)
         if self._modelled:
             self._wanted_y, self._played_y = (
@@ -320,8 +364,9 @@ class Supervisor(Checkpointed):
                 for before, now in ((self._wanted_y, wanted), (self._played_y, y))
             )
         self._samples += y.shape[1]
-        self._watch(np.concatenate((x, d)), y)
-        return y if self.multichannel else y[0]
+        heard = ~np.any(absent, axis=0)
+        self._watch(x[:, heard], e[:, heard], y)
+        return y
 
     # ---- What comes in
 
@@ -341,8 +386,11 @@ class Supervisor(Checkpointed):
             np.full((self.n_microphones, n), np.nan) if e is None else e,
         )
 
-    def _usable(self, x: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return which errors are missing, (K, n), and which samples can be learned from, (n,); note the bad ones."""
+    def _inspect(self, x: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what is missing of references and errors, (I + K, n), and which samples can be learned from, (n,).
+
+        The bad ones are noted.
+        """
         block = np.concatenate((x, e))
         repeated = self.blocks_can_repeat and is_repeated(block, self._last_block)
         self._last_block = block
@@ -357,10 +405,10 @@ class Supervisor(Checkpointed):
         since, self._since_bad_reference = _samples_since(bad_x, self._since_bad_reference)
         usable = ~bad_x & ~bad_e & (since >= self.recovery_samples)
         self._count_unusable(usable)
-        return np.isin(kinds[1], (NOT_FINITE, STUCK, REPEATED)), usable
+        return np.isin(np.concatenate(kinds), ABSENT), usable
 
-    def _as_wanted(self, e: np.ndarray, missing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the errors (K, n) if all that the controller wanted had been played, and the disturbances.
+    def _as_wanted(self, e: np.ndarray, missing: np.ndarray) -> np.ndarray:
+        """Return the errors (K, n) if all that the controller wanted had been played.
 
         The sound of this block does not count yet: an estimated path begins with at least a block of zeros. Where an
         error is missing, the disturbance is zero.
@@ -370,8 +418,7 @@ class Supervisor(Checkpointed):
             through(path, np.pad(y, ((0, 0), (0, e.shape[1]))))
             for y in (self._wanted_y, self._wanted_y - self._played_y)
         )
-        errors = np.where(missing, -wanted, e - withheld)
-        return errors, errors + wanted
+        return np.where(missing, -wanted, e - withheld)
 
     def _note_kinds(self, name: str, kinds: np.ndarray) -> None:
         """Record the bad samples of a block."""
@@ -385,7 +432,7 @@ class Supervisor(Checkpointed):
         """Fade out if nothing was usable for long, and in again afterwards."""
         good = np.flatnonzero(usable)
         self._unusable = usable.size - 1 - int(good[-1]) if good.size else self._unusable + usable.size
-        if self._unusable > self._mute_after and not self._paused_for_input and self._target == 1.0:
+        if self._unusable > self._mute_after and not self._paused_for_input and self._wanted:
             self._note("silent: no usable input")
             self._paused_for_input = True
         elif self._paused_for_input and self._unusable == 0:
@@ -401,6 +448,7 @@ class Supervisor(Checkpointed):
         gains = self._gains(n)
         # The controller does not know that its output is faded: it must forget that before it adapts.
         since, self._since_fade = _samples_since(gains < 1.0, self._since_fade)
+        self._silent_for = 0 if np.any(gains) else self._silent_for + n
         if not np.any(gains):
             self._listen(x, e, usable)
             wanted = np.zeros((self.n_loudspeakers, n))
@@ -453,10 +501,10 @@ class Supervisor(Checkpointed):
                 except RefusedUpdate as refused:
                     done = refused.sample + 1
                     self._note("refused", after=begin + refused.sample)
-                    self._refused += 1
+                    self._adaptation.refused += 1
                     refusals += 1
                     if refusals == MOST_REFUSALS:
-                        self._refused += int(np.count_nonzero(adapt[done + begin :]))
+                        self._adaptation.refused += int(np.count_nonzero(adapt[done + begin :]))
                         adapt = np.zeros_like(adapt)
                 except Exception as error:  # noqa: BLE001 - whatever it is, the loudspeakers must not be left with it
                     self._stop(f"diverged: {type(error).__name__}: {error}", at_once=True)
@@ -483,74 +531,64 @@ class Supervisor(Checkpointed):
         """Clip the control signals to their limits."""
         limit = self.amplitude_limit[:, np.newaxis]
         counts = np.count_nonzero(np.abs(y) > limit, axis=1)
-        self._limited += counts
+        self._adaptation.limited += counts
         np.clip(y, -limit, limit, out=y)
         for j in np.flatnonzero(counts):
             self._note("limited", f"loudspeaker {j}", n_samples=int(counts[j]))
 
-    # ---- The divergence monitor
+    # ---- What comes of it
 
-    def _begin_window(self) -> None:
-        self._counted, self._energy, self._reference_energy = 0, np.zeros(self.n_loudspeakers), 0.0
-        self._limited, self._refused = np.zeros(self.n_loudspeakers), 0
-        self._surprises: list[float] = []
+    def _watch(self, x: np.ndarray, e: np.ndarray, y: np.ndarray) -> None:
+        """Add a block to the window; at its end, act if the adaptation has diverged, or if the noise is louder.
 
-    def _watch(self, x: np.ndarray, y: np.ndarray) -> None:
-        """Add a block to the window; at its end, act if the adaptation has diverged."""
-        if self._target == 0.0 or self._gain < 1.0 or self._frozen > 0:
+        `x` and `e` have the samples that were heard; `y` has all.
+        """
+        silent, running = self._silent_for - y.shape[1] >= self._dies_away, self._gain == self._target == 1.0
+        watched = "silence" if silent else "control" if running else ""
+        if watched != self._watched:
+            self._watched = watched
+            self._adaptation.begin()
+            self._loudness.begin()
+        if watched == "silence":
+            self._hear_silence(x, e)
+        elif watched == "control" and not self._hear_control(x, e) and self._frozen == 0:
+            self._watch_adaptation(y)
+
+    def _hear_silence(self, x: np.ndarray, e: np.ndarray) -> None:
+        """Note how loud the noise is without control; end the listening when that is known."""
+        if not self._loudness.hear(x, e):
             return
-        self._counted += y.shape[1]
-        self._energy += np.sum(y * y, axis=1)
-        self._reference_energy += float(np.sum(x * x))
-        surprise = _surprise(self.controller)
-        if np.isfinite(surprise):
-            self._surprises.append(surprise)
-        if self._counted >= self._window:
-            what = self._divergence()
-            if what:
-                self._stop(f"diverged: {what}")
-            elif self._good is not None and self._loud_windows == 0:
+        self._loudness.note_silence()
+        if not (self._listening and self._loudness.full):
+            return
+        self._listening, suspected, self._suspected = False, self._suspected, None
+        if suspected is not None and self._loudness.is_louder(suspected, self._loudness.ratio**0.5):
+            self._stop("diverged: louder than without control")
+        elif suspected is not None:
+            self._note("the noise itself is louder")
+
+    def _hear_control(self, x: np.ndarray, e: np.ndarray) -> bool:
+        """Return whether the noise is louder than before control, and begin to listen without control if it is."""
+        loudness = self._loudness
+        if not (loudness.hear(x, e) and loudness.full and loudness.is_louder(loudness.windows, loudness.ratio)):
+            return False
+        self._note("louder than before control")
+        self._listening, self._suspected = True, loudness.windows
+        if self._frozen > 0:  # the last good state is good no longer
+            self._good = self._fresh, np.zeros_like(self._wanted_y)
+        return True
+
+    def _watch_adaptation(self, y: np.ndarray) -> None:
+        """Add the control signals of a block; at the end of the window, act if the adaptation has diverged."""
+        if not self._adaptation.play(y):
+            return
+        what = self._adaptation.judged(self.controller, self.largest_gain)
+        if what:
+            self._stop(f"diverged: {what}")
+        elif self._good is not None and self._adaptation.normal:
+            newest = self._loudness.windows[-1:]
+            if not self._loudness.is_louder(newest, self._loudness.ratio):
                 self._good = deepcopy(self.controller), self._wanted_y
-            self._begin_window()
-
-    def _divergence(self) -> str:
-        """Return what shows a divergence in this window; empty if nothing does."""
-        weights = getattr(self.controller, "control_filter", getattr(self.controller, "weights", np.zeros(1)))
-        gain = float(np.max(np.abs(np.atleast_1d(weights)).sum(axis=-1)))
-        if not gain <= self.largest_gain:
-            return "weights"
-        if self._refused > OFTEN_REFUSED * self._counted:
-            return "refused"
-        if self._is_loud():
-            self._loud_windows += 1
-            if self._loud_windows >= PATIENCE and not gain <= GROWN * self._normal_gain < np.inf:
-                return "power"
-        else:
-            self._loud_windows, self._normal_gain = 0, gain
-        return "innovation" if self._is_surprised() else ""
-
-    def _is_loud(self) -> bool:
-        """Return whether a control signal far exceeds its rated power, or is often at its limit."""
-        rated = getattr(self.controller, "rated_power", None)
-        over = rated is not None and np.any(self._energy / self._counted > OVER_POWER * np.asarray(rated))
-        return bool(over or np.any(self._limited > OFTEN_LIMITED * self._counted))
-
-    def _is_surprised(self) -> bool:
-        """Return whether the innovations are far larger than usual and predicted, and the reference does not explain it."""
-        if not self._surprises:
-            return False
-        mean, reference = float(np.mean(self._surprises)), self._reference_energy / self._counted
-        self._windows += 1
-        if self._windows <= SETTLING_WINDOWS or not np.isfinite(self._usual):
-            self._usual, self._usual_reference = mean, reference
-            return False
-        rise = max(reference / self._usual_reference, 1.0) if self._usual_reference > 0.0 else np.inf
-        if mean > SURPRISE * max(self._usual, 1.0) * rise:
-            self._windows = 0
-            return True
-        self._usual += (mean - self._usual) / USUAL_WINDOWS
-        self._usual_reference += (reference - self._usual_reference) / USUAL_WINDOWS
-        return False
 
     def _stop(self, why: str, at_once: bool = False) -> None:
         """Act on a divergence."""
@@ -574,8 +612,8 @@ class Supervisor(Checkpointed):
                 self._gain = 0.0
         self._pause = min(2 * self._pause, LONGEST_PAUSE * self._first_pause)
         self._since_bad_reference = 0
-        self._loud_windows, self._windows, self._normal_gain = 0, 0, np.inf
-        self._begin_window()
+        self._listening, self._suspected = False, None
+        self._adaptation.restart()
 
     def _note(self, what: str, channel: str = "", *, after: int = 0, n_samples: int = 1) -> None:
         begin = (self._samples + after) / self.fs
@@ -636,16 +674,3 @@ def _remembered(controller: Any) -> int:
     primary = getattr(controller, "primary_path", None)
     longest = n_taps if primary is None else max(n_taps, np.shape(primary)[-1])
     return int(longest + np.shape(path)[-1] + GUARD_TAPS)
-
-
-def _surprise(controller: Any) -> float:
-    """Return the squared innovation over its predicted variance of a Kalman filter's last update; NaN without one.
-
-    With several microphones it is their mean.
-    """
-    estimator = getattr(controller, "estimator", None)
-    innovation = getattr(controller, "innovation", getattr(estimator, "y", None))
-    variance = getattr(controller, "innovation_variance", getattr(estimator, "S", None))
-    if innovation is None or variance is None or np.size(innovation) != np.size(variance) or not np.all(variance):
-        return np.nan
-    return float(np.mean(np.ravel(innovation) ** 2 / np.ravel(variance)))

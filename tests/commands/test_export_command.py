@@ -19,7 +19,7 @@ from kfopc_filterpy import (
     kf_pb,
     simulate,
 )
-from kfopc_filterpy.controllers import VerifiedController
+from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.controllers.table import CORE
 from kfopc_filterpy.export import export_c, export_fmu
 from kfopc_filterpy.paths import PathTolerance, read_path
@@ -157,10 +157,10 @@ def test_what_is_wrong_in_a_settings_file_is_said_in_one_line(case, command, fol
 
 
 def test_other_wrong_input(command, folder, tmp_path):
-    VerifiedController(FxLMS(8, [0.0, 1.0], step_size=0.01)).save(folder / "wrapped.npz")
+    FeedbackNeutralizer(FxLMS(8, [0.0, 1.0], step_size=0.01), [0.0, 0.1]).save(folder / "wrapped.npz")
     (folder / "c.toml").write_text(described(**GOOD))
     for arguments, message in {
-        ("wrapped.npz",): r"FxLMS .* \(VerifiedController\) is not in the core and cannot be exported",
+        ("wrapped.npz",): r"FxLMS .* \(FeedbackNeutralizer\) is not in the core and cannot be exported",
         ("text.wav",): "text.wav",
         ("c.toml", "--name", "main"): "name must not be 'main'",
         ("c.toml", "--fmu"): "an FMU needs the sample rate: give --fs, or fs in the settings file",

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.controllers import MAKERS, quickly_verified
+from helpers.controllers import MAKERS
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, S, noises
 from helpers.simulation import Integrator
 
@@ -16,7 +16,6 @@ from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.paths import fir_path
 
 CASES: dict[str, Any] = {name: MAKERS[name] for name in ("FxLMS", "KF-ANC", "KF-OPC", "KF-PB")} | {
-    "verified path": lambda: quickly_verified(MAKERS["FxLMS"]()),
     "limited": lambda: LimitedController(Integrator(), OutputLimiter(0.05, fs=FS, window_s=0.01)),
     "own": Integrator,
 }

@@ -28,7 +28,6 @@ from kfopc_filterpy.checkpoint import content_of
 from kfopc_filterpy.controllers import (
     FeedbackNeutralizer,
     RefusedUpdate,
-    VerifiedController,
     VirtualMicrophones,
     with_internal_model,
 )
@@ -250,7 +249,6 @@ def test_a_refused_error_leaves_the_state_and_one_that_never_comes_counts_as_sil
         (with_internal_model, "has an internal model"),
         (lambda f: with_internal_model(FxLMS(4, PATHS, step_size=MU, n_references=K - 1)), "for each of the 3 error"),
         (lambda f: FeedbackNeutralizer(f, [0.0, 1.0]), "n_references of 0"),
-        (VerifiedController, "no controller with an internal"),
         (lambda f: Supervisor(f, fs=FS, amplitude_limit=1.0).process([1.0], [1.0]), "references must be None"),
         (
             lambda f: Supervisor(

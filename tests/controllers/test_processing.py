@@ -76,9 +76,7 @@ def test_the_only_reference_of_several_channels_needs_no_channel_axis(kind: Any)
     np.testing.assert_array_equal(without.process(x, e), expected)
 
 
-@pytest.mark.parametrize(
-    "name", ["KF-OPC plain", "two channels", "frequency domain", "VerifiedController", "FeedbackNeutralizer"]
-)
+@pytest.mark.parametrize("name", ["KF-OPC plain", "two channels", "frequency domain", "FeedbackNeutralizer"])
 def test_bad_blocks_are_refused_before_anything_changes(name: str) -> None:
     controller = MADE[name]()
     shape = (2, 10) if name == "two channels" else (10,)
@@ -107,7 +105,7 @@ def test_bad_blocks_are_refused_before_anything_changes(name: str) -> None:
     np.testing.assert_array_equal(controller.process(good, good), untouched.process(good, good))
 
 
-@pytest.mark.parametrize("name", ["KF-OPC plain", "FxLMS plain", "two channels", "VerifiedController"])
+@pytest.mark.parametrize("name", ["KF-OPC plain", "FxLMS plain", "two channels", "FeedbackNeutralizer"])
 def test_a_refused_update_names_its_sample_and_the_rest_can_go_on(name: str) -> None:
     controller = MADE[name]()
     steps = deepcopy(controller)

@@ -20,7 +20,7 @@ from kfopc_filterpy import (
     kf_pb,
     simulate,
 )
-from kfopc_filterpy.controllers import FeedbackNeutralizer, VerifiedController
+from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.paths import PathTolerance
 
 FS = 16000.0
@@ -40,9 +40,8 @@ RATED: dict[str, Any] = {
     "MOV, several": lambda power: MOVFxLMS(8, PATHS, step_size=1e-4, rated_power=power),
 }
 WRAPPERS: dict[str, Any] = {
-    "verifier": lambda inner: VerifiedController(inner, fs=FS),
     "neutraliser": lambda inner: FeedbackNeutralizer(inner, [0.0, 0.1]),
-    "verified neutraliser": lambda inner: VerifiedController(FeedbackNeutralizer(inner, [0.0, 0.1]), fs=FS),
+    "two neutralisers": lambda inner: FeedbackNeutralizer(FeedbackNeutralizer(inner, [0.0, 0.1]), [0.0, 0.0, 0.1]),
 }
 
 

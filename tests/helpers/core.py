@@ -37,7 +37,6 @@ ALGORITHMS: dict[str, Mapping[str, float]] = {
         "window": 1 - 2.0**-8,
         "spread": 2.0**-2,
     },
-    "observer": {"block": 16.0, "window": 1 - 2.0**-8, "spread": 2.0**-2},
     "signals_alone": {},
 }
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from kfopc_filterpy import KFOPC, FxLMS, KalmanController, OutputPowerConstraint, kf_anc, kf_opc
-from kfopc_filterpy.controllers import VerifiedController, with_internal_model
+from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.realtime import Health, SimulatedInterface, Supervisor
 
 FS = 8000.0
@@ -34,7 +34,6 @@ MAKERS: dict[str, Any] = {
     "KF-OPC": lambda: kf_opc(24, PATH, constraint=OutputPowerConstraint(0.5, fs=FS), **KALMAN),
     "FxLMS of several channels": lambda: FxLMS(16, PATHS, step_size=3e-4),
     "hybrid FxLMS of several channels": lambda: with_internal_model(FxLMS(16, PATHS, step_size=3e-4, n_references=3)),
-    "verified": lambda: VerifiedController(FxLMS(24, PATH, step_size=1e-3), fs=FS),
 }
 
 
@@ -58,9 +57,9 @@ def heard(supervisor: Supervisor, rng: np.random.Generator, blocks: int, length:
 
 
 def supervised(controller: Any, **changed: Any) -> Supervisor:
-    return Supervisor(
-        controller, **{"fs": FS, "amplitude_limit": LIMIT, "full_scale": 50.0, "mute_after_s": 2.0} | changed
-    )
+    """Return a supervisor that begins at once; `test_loudness.py` has those that listen first."""
+    settings = {"fs": FS, "amplitude_limit": LIMIT, "full_scale": 50.0, "mute_after_s": 2.0, "louder_s": None}
+    return Supervisor(controller, **settings | changed)
 
 
 def plant(several: bool = False, seconds: float = 3.0, **changed: Any) -> SimulatedInterface:
@@ -127,12 +126,11 @@ BAD: dict[str, Any] = {
     begin=st.integers(1, 16000),
     log_length=st.floats(0.0, 5.0),
     action=st.sampled_from(["mute", "reset", "freeze"]),
+    louder_s=st.sampled_from([None, 0.25]),
 )
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name == "verified" else []) for name in MAKERS]
-)
+@pytest.mark.parametrize("name", MAKERS)
 def test_whatever_comes_in_what_goes_out_is_finite_and_within_the_limit(
-    name: str, fault: str, where: str, begin: int, log_length: float, action: str
+    name: str, fault: str, where: str, begin: int, log_length: float, action: str, louder_s: float | None
 ) -> None:
     end = begin + round(10.0**log_length)
 
@@ -145,7 +143,7 @@ def test_whatever_comes_in_what_goes_out_is_finite_and_within_the_limit(
                 e[-1, a:b] = BAD[fault](e[-1, a:b])
         return x, e
 
-    supervisor = supervised(MAKERS[name](), on_divergence=action, pause_s=0.3)
+    supervisor = supervised(MAKERS[name](), on_divergence=action, pause_s=0.3, louder_s=louder_s)
     y, _ = loop(supervisor, plant(name.endswith("channels"), 3.0), spoil)
     assert np.all(np.isfinite(y))
     assert np.max(np.abs(y)) <= LIMIT
@@ -300,18 +298,6 @@ def test_the_innovation_of_a_core_controller_is_that_of_the_filter() -> None:
     assert several.innovation.shape == (2,)
 
 
-def test_surprising_innovations_are_a_divergence() -> None:
-    """The error suddenly is 60 dB up, and the reference is not."""
-
-    def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[Any, Any]:
-        return x, (1e3 * e if first >= 20000 else e)
-
-    free = kf_anc(24, PATH, **KALMAN)  # no power can be exceeded
-    supervisor = supervised(free, amplitude_limit=1e9, full_scale=None)
-    loop(supervisor, plant(seconds=4.0), spoil)
-    assert supervisor.health.counts["diverged: innovation"] >= 1
-
-
 def test_long_faults_fade_out_and_in_again() -> None:
     def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[Any, Any]:
         return x, (np.full_like(e, np.nan) if 8000 <= first < 20000 else e)
@@ -421,10 +407,11 @@ def test_a_frozen_internal_model_goes_on_with_the_reference_that_it_had() -> Non
 
 
 def test_fades_are_smooth() -> None:
-    supervisor = Supervisor(Playing(lambda n: 1.0), fs=FS, amplitude_limit=2.0, fade_s=0.05)
-    supervisor.start_silent()
+    supervisor = Supervisor(Playing(lambda n: 1.0), fs=FS, amplitude_limit=2.0, fade_s=0.05, louder_s=0.25)
+    supervisor.fade_out()
     rng = np.random.default_rng(0)
-    silent = heard(supervisor, rng, 1, 100)
+    silent = heard(supervisor, rng, 20, 100)  # it listens for a quarter of a second, and goes on being silent
+    assert supervisor.muted
     supervisor.fade_in()
     up = heard(supervisor, rng, 6, 100)
     supervisor.fade_out()
@@ -474,7 +461,7 @@ def test_a_pause_lasts_as_long_as_it_says_and_its_end_is_noted_once(user: str) -
     """Blocks of 64: NaN in block 3, silence from block 4 on, 13 blocks are the first to make 800 samples."""
     faults = [200]  # the controller that replaces the first one is sound
     once = Playing(lambda n: np.nan if faults and n == faults[0] and faults.pop() else 1.0)
-    supervisor = Supervisor(once, fs=FS, amplitude_limit=2.0, pause_s=0.1, fade_s=0.016)
+    supervisor = Supervisor(once, fs=FS, amplitude_limit=2.0, pause_s=0.1, fade_s=0.016, louder_s=None)
     rng = np.random.default_rng(0)
     y = []
     for block in range(30):
@@ -509,7 +496,7 @@ def test_a_controller_that_cannot_go_on_is_replaced(kind: str) -> None:
             raise RuntimeError("out of order")
         return 0.1
 
-    supervisor = Supervisor(Broken(played), fs=FS, amplitude_limit=1.0, on_divergence="reset")
+    supervisor = supervised(Broken(played), on_divergence="reset")
     y = heard(supervisor, np.random.default_rng(0), 100, 64)
     assert np.all(np.isfinite(y))
     what = "diverged: refused" if kind == "refuses" else "diverged: RuntimeError: out of order"
@@ -519,8 +506,8 @@ def test_a_controller_that_cannot_go_on_is_replaced(kind: str) -> None:
 
 def test_silence_with_bad_samples_keeps_the_delay_lines_in_time() -> None:
     """What is heard in silence after a bad sample is what a controller hears that was never disturbed."""
-    supervisor, other = supervised(MAKERS["KF-OPC"]()), MAKERS["KF-OPC"]()
-    supervisor.start_silent()
+    supervisor, other = supervised(MAKERS["KF-OPC"](), louder_s=1.0), MAKERS["KF-OPC"]()
+    supervisor.fade_out()
     x, e = np.random.default_rng(0).standard_normal((2, 2000))
     bad = x.copy()
     bad[100] = np.nan

@@ -49,7 +49,14 @@ MAKERS: dict[str, Any] = {
 
 def supervised(name: str, action: str = "") -> Supervisor:
     """Return a supervisor; with an action, one that soon finds the weights too large."""
-    times = {"window_s": 0.008, "fade_s": 0.01, "pause_s": 0.04, "stuck_s": 0.002, "mute_after_s": 0.03}
+    times = {
+        "window_s": 0.008,
+        "fade_s": 0.01,
+        "pause_s": 0.04,
+        "stuck_s": 0.002,
+        "mute_after_s": 0.03,
+        "louder_s": 0.016,
+    }
     acts = {"on_divergence": action, "largest_gain": 0.02} if action else {}
     return Supervisor(MAKERS[name](), fs=FS, amplitude_limit=2.0, full_scale=20.0, **times, **acts)
 
@@ -62,6 +69,8 @@ def block(supervisor: Supervisor, b: int) -> tuple[Any, Any, int]:
         x[..., 3:5], e[..., 7] = np.nan, 30.0
     if b in (17, 18):
         e[...] = 0.25
+    if b >= 45:  # it becomes louder by itself
+        e *= 4.0
     return (None if 30 <= b < 42 else x), e, 64 * (b % 13 == 12)
 
 
@@ -105,6 +114,7 @@ def test_a_supervisor_that_is_saved_between_any_blocks_continues_to_the_bit(
     # Something has happened to be remembered.
     counts = original.health.counts
     happened = {"not finite", "clipped", "stuck", "lost"}
+    happened |= {"louder than before control", "the noise itself is louder"} if name == "own" else set()
     happened |= {
         "": {"silent: no usable input", "running again"},
         "mute": {"diverged: weights", "muted", "running again"},
