@@ -18,9 +18,10 @@ from .options import DONE, Parser, add_command, add_count, add_number, add_scene
 from .printing import warn
 
 if TYPE_CHECKING:
-    from ..realtime import Interface, RunReport, RunStatus, SimulatedInterface
+    from ..realtime import Health, Interface, RunReport, RunStatus, SimulatedInterface
 
 FAULT = 1
+LATEST = 10  # events that the summary shows
 SMALL_BOUND_DB = 10.0  # below it, a shorter delay may be worth having
 
 EXAMPLES = """examples:
@@ -92,7 +93,7 @@ def run(options: argparse.Namespace) -> int:
         return FAULT
     if show is not None and sys.stderr.isatty():
         print(file=sys.stderr)  # the line of the status ends
-    print(_facts(report) if options.json else _summary(report, interface.fs, interface.block))
+    print(_facts(report) if options.json else summarize(report, interface.fs, interface.block))
     return FAULT if report.stopped_by.startswith("fault") else DONE
 
 
@@ -195,11 +196,16 @@ def _screen(stream: TextIO) -> Callable[[RunStatus], None]:
 def describe(status: RunStatus) -> str:
     """Return the status of a run as a line of text."""
     reductions = " ".join(f"{r:5.1f}" for r in status.reduction_db)
-    health = ", ".join(f"{n} {what}" for what, n in status.health.counts.items()) or "healthy"
+    health = _counted(status.health) or "healthy"
     return (
         f"{status.time_s:7.1f} s  reduction {reductions} dB  power {_powers(status)}  load {100 * status.load:.0f} %  "
         f"overruns {status.overruns}  {health}"
     )
+
+
+def _counted(health: Health) -> str:
+    """Return how often each kind of event was noticed, empty if nothing was."""
+    return ", ".join(f"{n} {what}" for what, n in health.counts.items())
 
 
 def _powers(report: RunStatus | RunReport, of: str = "") -> str:
@@ -217,7 +223,7 @@ def _facts(report: RunReport) -> str:
     return json.dumps(jsonable(facts | {"health": [vars(event) for event in report.health.events]}), indent=2)
 
 
-def _summary(report: RunReport, fs: float, block: int) -> str:
+def summarize(report: RunReport, fs: float, block: int) -> str:
     """Return a report as text."""
     lines = [f"{report.seconds:.1f} s under control, stopped by {report.stopped_by}"]
     if report.round_trip_samples is not None:
@@ -237,6 +243,7 @@ def _summary(report: RunReport, fs: float, block: int) -> str:
         f"output power {_powers(report, ' of the rated power')}",
         f"{report.overruns} of {report.blocks} blocks took longer than their duration, the longest {100 * report.load:.0f} % "
         f"of it; {report.lost} samples lost, {report.underflows} blocks too late for the output",
-        "health: " + ("; ".join(faults[-10:]) or "nothing noticed"),
+        f"health: {_counted(report.health) or 'nothing noticed'}",
+        *(f"  {fault}" for fault in faults[-LATEST:]),
     ]
     return "\n".join(lines)

@@ -117,12 +117,12 @@ class Supervisor(Checkpointed):
     - noise that is louder than before control, for example because a loudspeaker has the wrong polarity.
 
     For the last one, it compares the power of the errors, the sum over the microphones, with that of the last silence. If
-    the references have become louder since then, as much more is expected. If the mean over `louder_s` is `louder_db`
-    above that, where each window counts at most twice as many dB, the loudspeakers fade out, and it listens for as long. If
-    the noise is now softer by at least half of `louder_db`, that was a divergence. Otherwise the noise itself has
-    become louder, and the same controller fades in again. Without a reference microphone, noise that becomes louder by
-    itself costs such a silence each time. The loudness is not watched with virtual microphones: it may rightly rise
-    where the microphones are.
+    the references have become louder or softer since then, as much is expected of the errors, but no fall of more than
+    10 dB. If the mean over `louder_s` is `louder_db` above that, where each window counts at most twice as many dB, the
+    loudspeakers fade out, and the supervisor listens for as long. If the noise is now softer by at least half of
+    `louder_db`, that was a divergence. Otherwise the noise itself has become louder, and the same controller fades in
+    again. Without a reference microphone, noise that becomes louder by itself costs such a silence each time. The
+    loudness is not watched with virtual microphones: it may rightly rise where the microphones are.
 
     `save` and `load` include the controller, its copies, the fades and pauses under way, and the health record. Call
     `save` between two blocks.

@@ -13,6 +13,7 @@ from scipy.io import loadmat
 from scipy.signal import resample_poly
 
 from kfopc_filterpy import FxLMS, FxNLMS, OutputLimiter, OutputPowerConstraint, kf_opc, kf_pb, signals
+from kfopc_filterpy.commands.run import summarize
 from kfopc_filterpy.controllers import VirtualMicrophones, with_internal_model
 from kfopc_filterpy.realtime import SimulatedInterface, Supervisor, run
 from kfopc_filterpy.realtime.loudness import Loudness
@@ -64,11 +65,11 @@ def test_a_bang_counts_as_twice_the_decibels(bangs: int, louder: bool) -> None:
 
 def test_the_loudest_stretch_of_the_last_silence_counts() -> None:
     loudness = heard(np.array([[1, 1], [1, 1], [1, 3], [1, 3], [1, 3], [1, 3], [1, 1], [1, 1]]))
-    np.testing.assert_allclose(loudness.before, [1.0, 3.0])
+    np.testing.assert_allclose(np.asarray(loudness.before), [1.0, 3.0])
     for _ in range(4):
         loudness.hear(np.ones((1, 2)), np.ones((1, 2)))
         loudness.note_silence()
-    np.testing.assert_allclose(loudness.before, [1.0, 1.0])
+    np.testing.assert_allclose(np.asarray(loudness.before), [1.0, 1.0])
 
 
 def test_powers_do_not_depend_on_the_blocks() -> None:
@@ -183,9 +184,12 @@ def test_a_path_that_became_longer_is_in_the_report_of_a_run() -> None:
     )
     assert report.health.counts[BLAMED] == report.health.counts[LOUDER] == 3
     assert report.stopped_by == "fault: 3 divergences"
-    first = next(event for event in report.health.events if event.what == LOUDER)
-    assert first.time_s == pytest.approx(1.05, abs=0.05)  # it listened before
-    assert "diverged: louder than without control" in repr(report)
+    first, *_, last = (event.time_s for event in report.health.events if event.what == LOUDER)
+    assert first == pytest.approx(1.05, abs=0.05)  # it listened before
+    told = summarize(report, FS, BLOCK)
+    assert "stopped by fault: 3 divergences" in told
+    assert f"3 {LOUDER}, 3 {BLAMED}" in told
+    assert f"  {last:.2f} s: {LOUDER}\n" in told
 
 
 # What is no alarm.
