@@ -105,8 +105,8 @@ def require_finite(array: Any, name: str) -> None:
 
 def as_number(value: Any, name: str, *, unit: str = "") -> float:
     """Return `value` as a finite float."""
-    if type(value) is float and math.isfinite(value):  # fast path: called for every sample
-        return value
+    if isinstance(value, float) and math.isfinite(value):  # fast path, for numpy's floats too: called for every sample
+        return float(value)
     unit = f" in {unit}" if unit else ""
     if value is None or isinstance(value, str | bytes) or (np.ndim(value) != 0 and np.size(value) != 1):
         raise TypeError(f"{name} must be a single number{unit}, got {value!r}")

@@ -30,7 +30,16 @@ class ConstraintState(NamedTuple):
     powers: np.ndarray  # (3,) of POWER: disturbance, filtered reference, reference
     window: np.ndarray  # (3, m) this lap's squares, then the last lap's sums from each index on; m = 0: exponential
     numbers: np.ndarray  # (1,) of NUMBERS: settings, values last used
-    previewed: np.ndarray  # (1,) of PREVIEWED: room for what the next sample would make of them
+
+
+class _Room:
+    """What the core makes of a sample before it is accepted, and where it finds the state."""
+
+    def __init__(self, state: ConstraintState) -> None:
+        self.previewed = np.zeros(1, PREVIEWED)
+        self.squares = 0.0, 0.0, math.nan  # of the sample
+        powers, window, numbers, previewed = (array.ctypes.data for array in (*state, self.previewed))
+        self.places = numbers, powers, window, state.window.shape[1], previewed
 
 
 class OutputPowerConstraint:
@@ -87,7 +96,8 @@ class OutputPowerConstraint:
         for name in ("supplied_factor", "supplied_power", "supplied_gain", "gain"):
             numbers[name] = math.nan
         numbers["factor"] = 1.0
-        self._state = ConstraintState(np.zeros(3, POWER), np.zeros((3, length)), numbers, np.zeros(1, PREVIEWED))
+        self._state = ConstraintState(np.zeros(3, POWER), np.zeros((3, length)), numbers)
+        self._room: _Room | None = None
         self._given_gain = secondary_path_gain
         self.secondary_path_gain = secondary_path_gain
 
@@ -150,8 +160,17 @@ class OutputPowerConstraint:
         return math.isnan(numbers["supplied_gain"][0]) and math.isnan(numbers["supplied_factor"][0])
 
     def preview(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
-        """Return the constraint factor that `advance` would return for this sample; nothing is changed."""
-        return self.preview_sums(*self._squares(disturbance, filtered_reference, reference))[0]
+        """Return the constraint factor with this sample; the powers change only if `accept` follows.
+
+        `disturbance`, `filtered_reference` and `reference` are those of `advance`.
+        """
+        return self.preview_sums(*self._squares(disturbance, filtered_reference, reference))
+
+    def accept(self) -> float:
+        """Add the sample of the last `preview` to the powers and return the constraint factor."""
+        room = self._opened()
+        commit(*room.places, *room.squares)
+        return float(self._state.numbers["factor"][0])
 
     def advance(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
         """Add one sample to the powers and return the constraint factor.
@@ -175,29 +194,33 @@ class OutputPowerConstraint:
         ValueError
             NaN, Inf or a value whose square overflows; no reference although the gain must be estimated.
         """
-        return self.advance_sums(*self._squares(disturbance, filtered_reference, reference))
+        self.preview(disturbance, filtered_reference, reference)
+        return self.accept()
 
-    def preview_sums(self, d_squared: float, xf_squared: float, x_squared: float | None) -> tuple[float, float]:
-        """Return the factor and the gain (NaN: unknown) for the squares of a sample.
+    def preview_sums(self, d_squared: float, xf_squared: float, x_squared: float | None) -> float:
+        """Return what `preview` does for the squares of a sample, or for their sums over channels.
 
-        `d_squared`, `xf_squared` and `x_squared` are those of `advance`'s arguments, or their sums over channels.
+        `d_squared`, `xf_squared` and `x_squared` are those of `preview`'s arguments.
         """
-        previewed = np.zeros(1, PREVIEWED)
-        preview(*self._places(previewed), d_squared, xf_squared, self._known(x_squared))
-        return float(previewed["factor"][0]), float(previewed["gain"][0])
+        room = self._opened()
+        room.squares = d_squared, xf_squared, self._known(x_squared)
+        preview(*room.places, *room.squares)
+        return float(room.previewed["factor"][0])
 
-    def advance_sums(self, d_squared: float, xf_squared: float, x_squared: float | None) -> float:
-        """Add the squares of a sample, `d_squared`, `xf_squared` and `x_squared`, to the powers; return the factor."""
-        places = self._places(self._state.previewed)
-        squares = d_squared, xf_squared, self._known(x_squared)
-        preview(*places, *squares)
-        commit(*places, *squares)
-        return float(self._state.numbers["factor"][0])
+    @property
+    def previewed_gain(self) -> float:
+        """Power gain with the sample of the last `preview`, NaN if it is unknown."""
+        return float(self._opened().previewed["gain"][0])
 
-    def _places(self, previewed: np.ndarray) -> tuple[int, int, int, int, int]:
-        """Return where the core finds the numbers, the powers, the window with its length, and room for a preview."""
-        powers, window, numbers, _ = (array.ctypes.data for array in self._state)
-        return numbers, powers, window, self._state.window.shape[1], previewed.ctypes.data
+    def _opened(self) -> _Room:
+        """Return the room for a preview; that of a copy is made when it is first used."""
+        if self._room is None:
+            self._room = _Room(self._state)
+        return self._room
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes for a copy or a file, whose arrays are elsewhere."""
+        return self.__dict__ | {"_room": None}
 
     def live_in(self, powers: np.ndarray, window: np.ndarray, numbers: np.ndarray) -> None:
         """Go on in the arrays `powers`, `window` and `numbers` of a controller's block, which get the present numbers."""
@@ -207,7 +230,7 @@ class OutputPowerConstraint:
         )
         for own, place in zip(state, places, strict=True):
             place[...] = own
-        self._state = places
+        self._state, self._room = places, None
 
     def _known(self, x_squared: float | None) -> float:
         """Return the square of the reference, NaN if none is given and none is needed."""

@@ -60,8 +60,18 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
     def preview(
         self, disturbance: ArrayLike, filtered_reference: ArrayLike, reference: ArrayLike | None = None
     ) -> float:
-        """Return the factor that `advance` would return for this sample; nothing is changed."""
-        return self._preview(*self._sums(disturbance, filtered_reference, reference))
+        """Return the factor with this sample; the powers change only if `accept` follows.
+
+        `disturbance`, `filtered_reference` and `reference` are those of `advance`.
+        """
+        d, filtered, x = self._sums(disturbance, filtered_reference, reference)
+        factors = [one.preview_sums(d, xf, x) for one, xf in zip(self, filtered, strict=True)]
+        return _least([(factor, one.previewed_gain) for factor, one in zip(factors, self, strict=True)])
+
+    def accept(self) -> None:
+        """Add the sample of the last `preview` to the powers."""
+        for one in self:
+            one.accept()
 
     def advance(
         self, disturbance: ArrayLike, filtered_reference: ArrayLike, reference: ArrayLike | None = None
@@ -88,14 +98,9 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
             NaN, Inf or values whose squares overflow; no reference, although a gain must be estimated. Nothing was
             changed.
         """
-        d, filtered, x = self._sums(disturbance, filtered_reference, reference)
-        factor = self._preview(d, filtered, x)  # raises before any of them changes
-        for one, xf in zip(self, filtered, strict=True):
-            one.advance_sums(d, xf, x)
+        factor = self.preview(disturbance, filtered_reference, reference)
+        self.accept()
         return factor
-
-    def _preview(self, d: float, filtered: list[float], x: float | None) -> float:
-        return _least([one.preview_sums(d, xf, x) for one, xf in zip(self, filtered, strict=True)])
 
     def _sums(self, disturbance: Any, filtered: Any, reference: Any) -> tuple[float, list[float], float | None]:
         """Return the sums of squares of the disturbances, each loudspeaker's filtered references and the references."""
