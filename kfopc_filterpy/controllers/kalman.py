@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from .._types import PathModels, PerLoudspeaker, PerMicrophone
 from ..bounds.settings import SuggestedSettings
-from ..filters.checked_steps import undoing
 from ..filters.kfopc import KFOPC
 from ..power.amplifiers import Amplifier, Amplifiers
 from ..power.constraint import DEFAULT_FS, Constraints, OutputPowerConstraint
@@ -136,7 +135,7 @@ class KalmanController(CoreController):
         block, estimator = self._block, self.estimator
         d, x = float(block.fields["disturbance"].item()), float(block.latest("reference").flat[0])
         h, powers = block.latest("filtered_reference").reshape(1, -1)[:, : self.n_taps].copy(), self.constraint
-        undo = undoing(estimator)
+        before = estimator.__dict__.copy()  # predictions write into no array
         try:
             estimator.predict()
             if isinstance(estimator, KFOPC):
@@ -144,7 +143,8 @@ class KalmanController(CoreController):
             else:
                 estimator.update(np.full((1,) * np.ndim(estimator.x), d), H=h)
         except BaseException:  # the prediction must not stay
-            undo()
+            estimator.__dict__.clear()
+            estimator.__dict__.update(before)
             raise
         if powers is self._own_constraint:
             powers.advance(d, h[0, 0], x)

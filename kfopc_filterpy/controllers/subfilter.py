@@ -12,7 +12,6 @@ from .._types import PathModel
 from .._validate import as_count, as_number, as_positive, as_real_array, as_signal, require_finite
 from ..bounds.channel_bound import ChannelCorrelations
 from ..checkpoint import Checkpointed
-from ..filters.checked_steps import undoing
 from ..filters.kfopc import KFOPC
 from ..paths import path_taps
 from ..power.constraint import DEFAULT_FS, DEFAULT_MEMORY_S
@@ -217,12 +216,13 @@ class SubfilterKalman(BlockProcessing, Checkpointed):
     def update(self, error: float) -> None:
         """Let the gains adapt to the error e(n) that the last control signal left."""
         disturbance = float(_moderate(error, "error")[0] + self._played.output()[0])
-        undo = undoing(self.kf)
+        before = self.kf.__dict__.copy()  # predictions write into no array
         try:
             self.kf.predict()
             self.kf.update(disturbance, H=self._outputs[len(self.subfilters) :])
         except BaseException:  # the prediction must not stay
-            undo()
+            self.kf.__dict__.clear()
+            self.kf.__dict__.update(before)
             raise
 
     def listen(self, references: Any, errors: Any) -> None:

@@ -40,10 +40,6 @@ _CALLS = {
     "limit": "rPPr",
     "limit_all": "-PPPPq",
     "amplify_all": "-PPPq",
-    "covariance_size": "Ni",
-    "covariance_describe": "-iVP",
-    "covariance_predict": "-Pirr",
-    "covariance_update": "iPiPPrrP",
 }
 
 
@@ -57,7 +53,7 @@ class Library(NamedTuple):
 
 
 class Field(NamedTuple):
-    """A field of a controller's memory, or of a covariance's, as the core describes it."""
+    """A field of a controller's memory, as the core describes it."""
 
     name: str
     role: int

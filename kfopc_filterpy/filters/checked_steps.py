@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike
+from scipy.linalg.blas import dasum  # the sum of the magnitudes: quick, and without a warning if it overflows
 
 from .._validate import as_finite_array, as_number, as_real_array, require_finite
 
-INDEFINITE_LIMIT = 1e-8  # of the largest element: a more negative eigenvalue of P is not rounding
+# Of the largest element: rounding makes P neither less symmetric, nor one of its eigenvalues more negative.
+ASYMMETRY_LIMIT, INDEFINITE_LIMIT = 1e-8, 1e-8
 
 FLOAT = np.dtype(np.float64)
 
@@ -26,35 +28,6 @@ NOT_FINITE = (
 )
 
 Checks = Callable[..., Any]  # of the arguments of a step, with the filter before them
-State = tuple[dict[str, Any], dict[str, Any]]
-
-
-def state_of(kf: KalmanFilter) -> State:
-    """Return the attributes of a filter, as two dicts: those in its __dict__ and those in slots."""
-    slots = [name for kind in type(kf).__mro__ for name in vars(kind).get("__slots__", ())]
-    return dict(kf.__dict__), {name: getattr(kf, name) for name in slots if hasattr(kf, name)}
-
-
-def restore(kf: KalmanFilter, state: State) -> None:
-    """Give a filter back the attributes that `state_of` returned."""
-    attributes, private = state
-    kf.__dict__.clear()
-    kf.__dict__.update(attributes)
-    for name, value in private.items():
-        setattr(kf, name, value)
-
-
-def undoing(kf: KalmanFilter) -> Callable[[], None]:
-    """Return a function that takes back the steps of a filter from now on; a random walk's only if no pass has applied them."""
-    before, covariance = state_of(kf), getattr(kf, "_covariance", None)
-    take_back = None if covariance is None else covariance.undoing()
-
-    def undo() -> None:
-        restore(kf, before)
-        if take_back is not None:
-            take_back()
-
-    return undo
 
 
 def run_or_undo(kf: KalmanFilter, step: Callable[..., None], arguments: tuple[Any, ...], checks: Checks | None) -> None:
@@ -88,16 +61,13 @@ def run_or_undo(kf: KalmanFilter, step: Callable[..., None], arguments: tuple[An
 
 
 def _is_plainly_sound(kf: KalmanFilter) -> bool:
-    """Return whether x and P are finite arrays of floats of the usual sizes.
-
-    Finite sums imply finite elements. `vdot` is quick for many elements, and overflows without a warning.
-    """
+    """Return whether x and P are finite arrays of floats of the usual sizes; a finite sum implies finite elements."""
     x, P, n = kf.x, kf.P, kf.dim_x
     if not (type(x) is type(P) is np.ndarray and x.dtype == P.dtype == FLOAT):
         return False
     if x.shape not in ((n, 1), (n,)) or P.shape != (n, n):
         return False
-    return isfinite(np.vdot(P, P)) and isfinite(sum(x.ravel().tolist()))
+    return isfinite(dasum(x) + dasum(P.ravel()))
 
 
 def _require_sound(kf: KalmanFilter) -> None:
@@ -263,6 +233,22 @@ def require_variance(value: ArrayLike, size: int, name: str) -> None:
         as_finite_array(value, name)
     if np.min(np.diagonal(value) if np.ndim(value) == 2 else value) < 0:
         raise ValueError(f"{name} must not be negative: it is a variance, got {value!r}")
+
+
+def as_covariance(value: Any, size: int, name: str) -> np.ndarray:
+    """Return a matrix (size, size) that is symmetric and positive semidefinite to rounding, or raise a clear error."""
+    matrix = as_real_array(value, name)
+    require_matrix(matrix, (size, size), name)
+    if np.diagonal(matrix).min() < 0:
+        raise ValueError(f"{name} must be positive semidefinite, without negative variances on its diagonal")
+    difference = np.abs(matrix - matrix.T)
+    if difference.max() > ASYMMETRY_LIMIT * np.abs(matrix).max():
+        i, j = np.unravel_index(np.argmax(difference), matrix.shape)
+        raise ValueError(
+            f"{name} must be symmetric, but [{i}, {j}] holds {matrix[i, j]:g} and [{j}, {i}] {matrix[j, i]:g}"
+        )
+    require_semidefinite(matrix, name)
+    return 0.5 * matrix + 0.5 * matrix.T
 
 
 def require_semidefinite(value: ArrayLike, name: str) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from math import sqrt
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike
 
 from .._types import NumberOrArray, PerLoudspeaker
-from .._validate import as_count, as_nonnegative, as_number, as_real_array, as_signal, require_finite
+from .._validate import as_count, as_finite_array, as_nonnegative, as_number, as_signal, require_finite
 from ..checkpoint import Checkpointed
 from . import checked_steps
 
@@ -22,20 +22,30 @@ if TYPE_CHECKING:
     from .random_walk import RandomWalkKFOPC
 
 MOST_STATES_SHOWN = 8  # with more, `repr` is a summary: filterpy's shows every matrix
+EQUAL_ROWS = 10  # steps in which H may be the same: the reference of noise control changes from sample to sample
+TRACKER = (
+    "a rated power scales what weights drive an actuator with, and H has the newest reference samples. This filter tracks "
+    "a state, which a scaled measurement would only make wrong. For an estimate within limits use "
+    "kfopc_filterpy.filters.constrained; if a sensor saturates, mask its samples; if an actuator does, pass predict the "
+    "input u that it delivered"
+)
 
 
-class _Matrix:
-    """An attribute of filterpy that it transposes: a list or tuple assigned to it is stored as an array.
+class Assigned:
+    """An attribute of filterpy that is checked, and converted, when it is assigned: `check(kf, value, name)` returns it.
 
     It is no property, because filterpy's `Saver` would record a property twice. Without `__get__`, Python reads the
     attribute from the filter's `__dict__`.
     """
 
+    def __init__(self, check: Callable[[Any, Any, str], Any]) -> None:
+        self.check = check
+
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
 
     def __set__(self, kf: Any, value: Any) -> None:
-        kf.__dict__[self.name] = checked_steps.as_matrix(value, self.name)
+        kf.__dict__[self.name] = self.check(kf, value, self.name)
 
 
 class KFOPC(KalmanFilter, Checkpointed):
@@ -128,18 +138,15 @@ class KFOPC(KalmanFilter, Checkpointed):
     0.25
     """
 
-    if not TYPE_CHECKING:  # Keeps these out of filterpy's `Saver`, which records __dict__.
-        __slots__ = ("_batch_references", "_constraint", "_lifted", "_unconstrained_factor")
-
-    _written_into: ClassVar[tuple[str, ...]] = ("_constraint",)  # in slots
+    _in_place: ClassVar[tuple[str, ...]] = ("_constraint", "_written")  # attributes that steps write into
 
     x: Any  # assigned by filterpy, like the others
     y: Any
     z: Any
     K: Any
     _mahalanobis: Any
-    F: Any = _Matrix()
-    H: Any = _Matrix()
+    F: Any = Assigned(lambda _, value, name: checked_steps.as_matrix(value, name))
+    H: Any = Assigned(lambda _, value, name: checked_steps.as_matrix(value, name))
 
     def __init__(
         self,
@@ -153,8 +160,11 @@ class KFOPC(KalmanFilter, Checkpointed):
         self._constraint: Any = None
         self._lifted: Any = None  # the constraint before it was lifted, for its settings
         self._unconstrained_factor = 1.0
-        self._batch_references: BatchReferences | None = None
+        self._moved = False  # by a control input
+        self._written, self._writes = [0], 0  # steps that wrote in place, see `_require_whole`
         dim_x, dim_z = as_count(dim_x, "dim_x"), as_count(dim_z, "dim_z")
+        self._row = np.zeros((dim_z, dim_x))  # the last H with a rated power,
+        self._equal_rows = 0  # in how many steps it has been the same, and -1 once it has changed
         super().__init__(dim_x, dim_z, dim_u)
         if constraint is not None:
             if rated_power is not None:
@@ -219,6 +229,172 @@ class KFOPC(KalmanFilter, Checkpointed):
             "initial_variance": initial_variance,
         }
         return RandomWalkKFOPC(n_taps, **noises, rated_power=rated_power, constraint=constraint)
+
+    # The steps.
+
+    def predict(
+        self,
+        u: ArrayLike | None = None,
+        B: ArrayLike | None = None,
+        F: ArrayLike | None = None,
+        Q: ArrayLike | None = None,
+    ) -> None:
+        """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
+        if not checked_steps.is_usual_prediction(self, F, Q):
+            u, B, F, Q = checked_steps.checked_prediction(self, u, B, F, Q)
+        if self._constraint is not None:
+            self._require_random_walk(self.F if F is None else F)
+        self._all_or_nothing(super().predict, checked_steps.checked_prediction, u, B, F, Q)
+        self._moved = self._moved or self._has_input(u, B)
+
+    def update(
+        self,
+        z: ArrayLike | None,
+        R: ArrayLike | None = None,
+        H: ArrayLike | None = None,
+        *,
+        reference: ArrayLike | None = None,
+    ) -> None:
+        """Correct the state with a measurement, scaled by the constraint factor (eq. 9).
+
+        Parameters
+        ----------
+        z : float, array_like or None
+            Measurement, (dim_z, 1) or what converts to it. None is a missed sample: nothing is corrected and
+            no power estimate advances. Masked components of a masked array are missing: the state is corrected by
+            the others, with their rows of H and R. `z` is NaN there, `y` and the column of `K` are 0, and the likelihoods
+            are those of the others. All masked is None.
+        R : float or array_like, optional
+            Measurement noise variance of this step; by default `self.R`.
+        H : array_like, optional
+            Observation of this step, (n,) or (dim_z, n); by default `self.H`. With a rated power, the first element of
+            each control filter's part is the newest filtered reference x'(n).
+        reference : float or array_like, shape (I,), optional
+            Newest reference x(n), which with x'(n) gives the secondary-path gain (eq. 11). With several references, the
+            rated powers must be a sequence, even for one loudspeaker.
+
+        Raises
+        ------
+        ValueError
+            NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, a silent reference
+            with R = 0, or a rated power with neither a reference nor a secondary-path gain, or with only some of the
+            measurements. The filter is unchanged and can continue.
+        TypeError
+            A measurement that is not a real number.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from kfopc_filterpy import KFOPC
+        >>> kf = KFOPC(dim_x=2, dim_z=2)
+        >>> kf.H = np.eye(2)
+        >>> kf.update(np.ma.masked_invalid([4.0, np.nan]))  # the second component is missing
+        >>> kf.x.ravel(), kf.z.ravel()
+        (array([2., 0.]), array([ 4., nan]))
+        """
+        missing = None
+        if isinstance(z, np.ma.MaskedArray):
+            z, R, H, missing = checked_steps.without_masked(self, z, R, H)
+            if missing is not None and self._constraint is not None:
+                raise ValueError("a rated power needs all measurements at once: mask them all if one is missing")
+        plain = self._constraint is None and self._unconstrained_factor == 1.0
+        if z is None:
+            super().update(None)
+        elif plain and reference is None and checked_steps.is_usual_measurement(self, z, R, H):
+            self._all_or_nothing(super().update, checked_steps.checked_measurement, z, R, H)
+        else:
+            z, R, H = checked_steps.checked_measurement(self, z, R, H)
+            self._scaled_step(super().update, z, R, H, H=H, reference=reference)
+        if missing is not None:
+            self.z[missing] = np.nan
+
+    def predict_steadystate(self, u: ArrayLike = 0, B: ArrayLike | None = None) -> None:
+        """Run filterpy's `predict_steadystate`; arguments that would corrupt the filter raise an error first."""
+        if self._constraint is not None:
+            self._require_random_walk(self.F)
+        self._all_or_nothing(super().predict_steadystate, checked_steps.require_control, u, B)
+        self._moved = self._moved or self._has_input(u, B)
+
+    def update_steadystate(self, z: ArrayLike | None, *, reference: ArrayLike | None = None) -> None:
+        """Run filterpy's `update_steadystate` with the measurement scaled; see `update`."""
+        if z is None:
+            super().update_steadystate(None)
+            return
+        checked_steps.require_matrix(self.K, (self.dim_x, self.dim_z), "K")
+        z, _, _ = checked_steps.checked_measurement(self, z, None, None)
+        self._scaled_step(super().update_steadystate, z, H=None, reference=reference)
+
+    def update_correlated(
+        self,
+        z: ArrayLike | None,
+        R: ArrayLike | None = None,
+        H: ArrayLike | None = None,
+        *,
+        reference: ArrayLike | None = None,
+    ) -> None:
+        """Run filterpy's `update_correlated` with the measurement scaled; see `update`. `M` is (dim_x, dim_z)."""
+        if z is None:
+            super().update_correlated(None)
+            return
+        checked_steps.require_matrix(self.M, (self.dim_x, self.dim_z), "M")
+        z, R, H = checked_steps.checked_measurement(self, z, R, H)
+        self._scaled_step(super().update_correlated, z, R, H, H=H, reference=reference)
+
+    def update_sequential(
+        self,
+        start: int,
+        z_i: ArrayLike,
+        R_i: ArrayLike | None = None,
+        H_i: ArrayLike | None = None,
+        *,
+        reference: ArrayLike | None = None,
+    ) -> None:
+        """Run filterpy's `update_sequential` (filterpy 2.0.0) with the measurement scaled; see `update`."""
+        if not hasattr(KalmanFilter, "update_sequential"):
+            raise AttributeError("this filterpy has no update_sequential: it needs filterpy 2.0.0 or later")
+        length = np.size(z_i)
+        if not 0 <= start <= self.dim_z - length:
+            raise ValueError(f"start must be 0 to dim_z - len(z_i) = {self.dim_z - length}, got {start}")
+        checked_steps.require_measurement(z_i, length)
+        rows = self.H[start : start + length] if H_i is None else np.reshape(H_i, (length, self.dim_x))
+        require_finite(rows, "H_i")
+        noise = self.R[start : start + length, start : start + length] if R_i is None else R_i
+        checked_steps.require_variance(noise, length, "R_i")
+        if not np.any(rows) and not np.any(noise):
+            raise ValueError(checked_steps.SILENT_REFERENCE)
+
+        def update_sequential(scaled: Any, R_i: Any, H_i: Any) -> None:
+            # filterpy writes into these four in place: give it copies, so that the step can be undone
+            self.x, self.y, self.K = self.x.copy(), self.y.copy(), self.K.copy()
+            self.z = np.array(self.z).reshape(self.dim_z, 1)
+            KalmanFilter.update_sequential(self, start, scaled, R_i, H_i)
+
+        self._scaled_step(update_sequential, z_i, R_i, H_i, H=rows, reference=reference, start=start)
+
+    def _scaled_step(
+        self, step: Callable[..., None], z: Any, *others: Any, H: Any, reference: Any, start: int | None = None
+    ) -> None:
+        """Run a step on the scaled measurement (eq. 9), then accept its powers; an error leaves the filter unchanged."""
+        factor = self.constraint_factor
+        reference = None if reference is None else self._checked_reference(reference)
+        if self._constraint is not None:
+            rows = self.H if H is None else H
+            self._require_whole()
+            self._require_random_walk(self.F)
+            self._require_other_row(rows)
+            shared, sample = self._powers_sample(z, rows, reference)
+            factor = shared.preview(*sample)
+        self._all_or_nothing(step, None, self._scaled(z, factor), *others)
+        if factor != 1.0:  # store z as given, not scaled, in filterpy's shape
+            if start is None:
+                self.z = np.reshape(z, np.shape(self.z)).copy()
+            else:
+                self.z[start : start + np.size(z)] = np.reshape(z, (-1, 1))
+        if self._constraint is not None:
+            self._written[0] += 1
+            shared.accept()
+            self._note_row(rows)
+            self._writes += 1
 
     # The constraint: its values can be read, or supplied by the caller.
 
@@ -310,143 +486,48 @@ class KFOPC(KalmanFilter, Checkpointed):
             raise ValueError(f"{name} needs a constraint: set rated_power first")
         return self._constraint
 
-    # filterpy's steps.
+    def _checked_reference(self, reference: Any) -> Any:
+        """Return a reference as a number, or several as (I,) if the rated powers are listed for loudspeakers."""
+        one = np.size(reference) == 1 or not isinstance(self._constraint, tuple)
+        return as_number(reference, "reference") if one else as_signal(reference, "reference")
 
-    def predict(
-        self,
-        u: ArrayLike | None = None,
-        B: ArrayLike | None = None,
-        F: ArrayLike | None = None,
-        Q: ArrayLike | None = None,
-    ) -> None:
-        """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
-        if not checked_steps.is_usual_prediction(self, F, Q):
-            u, B, F, Q = checked_steps.checked_prediction(self, u, B, F, Q)
-        self._all_or_nothing(super().predict, checked_steps.checked_prediction, u, B, F, Q)
+    def _powers_sample(self, z: Any, H: Any, reference: Any) -> tuple[SharedConstraint, tuple[Any, Any, Any]]:
+        """Return the constraint, and what it takes: measurements, newest filtered references, references."""
+        from ..power.shared_constraint import SharedConstraint
 
-    def predict_steadystate(self, u: ArrayLike = 0, B: ArrayLike | None = None) -> None:
-        """Run filterpy's `predict_steadystate`; arguments that would corrupt the filter raise an error first."""
-        self._all_or_nothing(super().predict_steadystate, checked_steps.require_control, u, B)
+        shared: Any = self._constraint if isinstance(self._constraint, tuple) else SharedConstraint([self._constraint])
+        rows = np.reshape(H, (-1, self.dim_x))
+        if len(rows) != self.dim_z:
+            raise ValueError(f"a rated power needs all dim_z = {self.dim_z} measurements, rows of H, got {len(rows)}")
+        filters = len(shared), 1 if reference is None else np.size(reference)
+        if self.dim_x % (filters[0] * filters[1]):
+            raise ValueError(
+                f"reference must have one sample for each reference, but dim_x = {self.dim_x} states cannot be the "
+                f"control filters of {filters[0]} loudspeaker(s) for {filters[1]} reference(s)"
+            )
+        newest = rows.reshape(self.dim_z, *filters, -1)[..., 0].swapaxes(0, 1)
+        return shared, (z, newest, reference)
 
-    def update(
-        self,
-        z: ArrayLike | None,
-        R: ArrayLike | None = None,
-        H: ArrayLike | None = None,
-        *,
-        reference: ArrayLike | None = None,
-    ) -> None:
-        """Correct the state with a measurement, scaled by the constraint factor (eq. 9).
+    # A rated power is for weights that drive an actuator, not for a state that is tracked.
 
-        Parameters
-        ----------
-        z : float, array_like or None
-            Measurement, (dim_z, 1) or what converts to it. None is a missed sample: nothing is corrected and
-            no power estimate advances. Masked components of a masked array are missing: the state is corrected by
-            the others, with their rows of H and R. `z` is NaN there, `y` and the column of `K` are 0, and the likelihoods
-            are those of the others. All masked is None.
-        R : float or array_like, optional
-            Measurement noise variance of this step; by default `self.R`.
-        H : array_like, optional
-            Observation of this step, (n,) or (dim_z, n); by default `self.H`. With a rated power, the first element of
-            each control filter's part is the newest filtered reference x'(n).
-        reference : float or array_like, shape (I,), optional
-            Newest reference x(n), which with x'(n) gives the secondary-path gain (eq. 11). With several references, the
-            rated powers must be a sequence, even for one loudspeaker.
+    def _require_random_walk(self, F: Any) -> None:
+        """Raise an error if F is not the identity."""
+        if not np.array_equal(F, self._I if np.ndim(F) else 1.0):
+            raise ValueError(f"with a rated power, F must be the identity: {TRACKER}")
 
-        Raises
-        ------
-        ValueError
-            NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, a silent reference
-            with R = 0, or a rated power with neither a reference nor a secondary-path gain, or with only some of the
-            measurements. The filter is unchanged and can continue.
-        TypeError
-            A measurement that is not a real number.
+    def _require_other_row(self, H: Any) -> None:
+        """Raise an error if H does not change."""
+        if self._equal_rows >= EQUAL_ROWS and np.any(H) and np.array_equal(np.reshape(H, self._row.shape), self._row):
+            raise ValueError(f"with a rated power, H must change, but was the same in {EQUAL_ROWS} steps: {TRACKER}")
 
-        Examples
-        --------
-        >>> import numpy as np
-        >>> from kfopc_filterpy import KFOPC
-        >>> kf = KFOPC(dim_x=2, dim_z=2)
-        >>> kf.H = np.eye(2)
-        >>> kf.update(np.ma.masked_invalid([4.0, np.nan]))  # the second component is missing
-        >>> kf.x.ravel(), kf.z.ravel()
-        (array([2., 0.]), array([ 4., nan]))
-        """
-        missing = None
-        if isinstance(z, np.ma.MaskedArray):
-            z, R, H, missing = checked_steps.without_masked(self, z, R, H)
-            if missing is not None and self._constraint is not None:
-                raise ValueError("a rated power needs all measurements at once: mask them all if one is missing")
-        reference = self._next_reference(z, reference)
-        if z is None:
-            super().update(None)
-            return
-        plain = self._constraint is None and self._unconstrained_factor == 1.0
-        if plain and checked_steps.is_usual_measurement(self, z, R, H):
-            self._all_or_nothing(super().update, checked_steps.checked_measurement, z, R, H)
-        else:
-            z, R, H = checked_steps.checked_measurement(self, z, R, H)
-            self._scaled_step(super().update, z, R, H, H=H, reference=reference)
-        if missing is not None:
-            self.z[missing] = np.nan
+    def _note_row(self, H: Any) -> None:
+        """Count the steps with the same H, until there is another."""
+        if self._equal_rows >= 0:
+            row = np.array(H, dtype=np.float64).reshape(self._row.shape)
+            same = self._equal_rows == 0 or np.array_equal(row, self._row)
+            self._row, self._equal_rows = row, self._equal_rows + 1 if same else -1
 
-    def update_steadystate(self, z: ArrayLike | None, *, reference: ArrayLike | None = None) -> None:
-        """Run filterpy's `update_steadystate` with the measurement scaled; see `update`."""
-        if z is None:
-            super().update_steadystate(None)
-            return
-        reference = self._next_reference(z, reference)
-        z, _, _ = checked_steps.checked_measurement(self, z, None, None)
-        self._scaled_step(super().update_steadystate, z, H=None, reference=reference)
-
-    def update_correlated(
-        self,
-        z: ArrayLike | None,
-        R: ArrayLike | None = None,
-        H: ArrayLike | None = None,
-        *,
-        reference: ArrayLike | None = None,
-    ) -> None:
-        """Run filterpy's `update_correlated` with the measurement scaled; see `update`."""
-        if z is None:
-            super().update_correlated(None)
-            return
-        reference = self._next_reference(z, reference)
-        z, R, H = checked_steps.checked_measurement(self, z, R, H)
-        self._scaled_step(super().update_correlated, z, R, H, H=H, reference=reference)
-
-    def update_sequential(
-        self,
-        start: int,
-        z_i: ArrayLike,
-        R_i: ArrayLike | None = None,
-        H_i: ArrayLike | None = None,
-        *,
-        reference: ArrayLike | None = None,
-    ) -> None:
-        """Run filterpy's `update_sequential` (filterpy 2.0.0) with the measurement scaled; see `update`."""
-        if not hasattr(KalmanFilter, "update_sequential"):
-            raise AttributeError("this filterpy has no update_sequential: it needs filterpy 2.0.0 or later")
-        reference = self._next_reference(z_i, reference)
-        length = np.size(z_i)
-        if not 0 <= start <= self.dim_z - length:
-            raise ValueError(f"start must be 0 to dim_z - len(z_i) = {self.dim_z - length}, got {start}")
-        checked_steps.require_measurement(z_i, length)
-        rows = self.H[start : start + length] if H_i is None else np.reshape(H_i, (length, self.dim_x))
-        require_finite(rows, "H_i")
-        noise = self.R[start : start + length, start : start + length] if R_i is None else R_i
-        checked_steps.require_variance(noise, length, "R_i")
-        if not np.any(rows) and not np.any(noise):
-            raise ValueError(checked_steps.SILENT_REFERENCE)
-
-        def update_sequential(scaled: Any, R_i: Any, H_i: Any) -> None:
-            # filterpy writes into these four in place: give it copies, so that the step can be undone
-            self.x, self.y, self.K = self.x.copy(), self.y.copy(), self.K.copy()
-            self.z = np.array(self.z).reshape(self.dim_z, 1)
-            KalmanFilter.update_sequential(self, start, scaled, R_i, H_i)
-
-        self._scaled_step(update_sequential, z_i, R_i, H_i, H=rows, reference=reference, start=start)
+    # Batches, the smoother, and what changes nothing.
 
     def batch_filter(
         self,
@@ -493,27 +574,124 @@ class KFOPC(KalmanFilter, Checkpointed):
         >>> kf.batch_filter(zs)[0].ravel().round(2)  # the second sample is missing
         array([0.67, 0.67, 0.91])
         """
-        batch: BatchReferences | None = None
-        if references is not None:
-            batch = BatchReferences(self._checked_references(references, len(zs)))
-        for name, given in {"Fs": Fs, "Qs": Qs, "Hs": Hs, "Rs": Rs, "Bs": Bs, "us": us}.items():
-            if given is not None and len(given) < len(zs):  # filterpy would stop there and leave zeros
-                raise ValueError(f"{name} must have one value for each of the {len(zs)} of zs, got {len(given)}")
-        # in an array of objects, because filterpy 1.4.5 cannot count a list of arrays and None
-        samples = np.fromiter(zs, dtype=object, count=len(zs))
+        n = len(zs)
+        # filterpy's batch, unlike its steps, takes a number in Q and R as a multiple of the identity
+        Qs, Rs = (
+            [own] * n if given is None and np.ndim(own) == 0 else given for given, own in ((Qs, self.Q), (Rs, self.R))
+        )
+        lists = {"Fs": Fs, "Qs": Qs, "Hs": Hs, "Rs": Rs, "Bs": Bs, "us": us}
+        for name, given in lists.items():
+            if given is not None and len(given) < n:  # filterpy would stop there and leave zeros
+                raise ValueError(f"{name} must have one value for each of the {n} of zs, got {len(given)}")
+        steps = zip(zs, *([None] * n if given is None else given for given in lists.values()), strict=False)
+        samples: Any = [None] * n if references is None else as_finite_array(references, "references")
+        if np.shape(samples)[:1] != (n,):
+            raise ValueError(f"references must have {n} values, got shape {np.shape(samples)}")
+        means, means_p = np.zeros((2, n, *np.shape(self.x)))
+        covariances, covariances_p = np.zeros((2, n, self.dim_x, self.dim_x))
         before = self._snapshot()
-        self._batch_references = batch
-        counting = CountingSaver(saver)
         try:
-            result = super().batch_filter(samples, Fs, Qs, Hs, Rs, Bs, us, update_first, counting)
+            for i, (z, F, Q, H, R, B, u) in enumerate(steps):
+                for updates in (update_first, not update_first):
+                    if updates:
+                        self.update(z, R, H, reference=samples[i])
+                        means[i], covariances[i] = self.x, self.P
+                    else:
+                        self.predict(u, B, F, Q)
+                        means_p[i], covariances_p[i] = self.x, self.P
+                if saver is not None:
+                    saver.save()
         except BaseException as error:
-            checked_steps.restore(self, before)
+            self._go_back(before)
             if not isinstance(error, ValueError | TypeError):
                 raise
             kind = TypeError if isinstance(error, TypeError) else ValueError
-            raise kind(f"step {counting.steps} of the batch: {error}") from error
-        self._batch_references = None
-        return result
+            raise kind(f"step {i} of the batch: {error}") from error
+        return means, covariances, means_p, covariances_p
+
+    def rts_smoother(
+        self,
+        Xs: ArrayLike,
+        Ps: ArrayLike,
+        Fs: Sequence[Any] | np.ndarray | None = None,
+        Qs: Sequence[Any] | np.ndarray | None = None,
+        inv: Callable[[np.ndarray], np.ndarray] = np.linalg.inv,
+        *,
+        us: Sequence[Any] | np.ndarray | None = None,
+        Bs: Sequence[Any] | np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Run filterpy's `rts_smoother`, with the control inputs that it leaves out.
+
+        Parameters
+        ----------
+        Xs, Ps : array_like, shapes (n_samples, dim_x[, 1]) and (n_samples, dim_x, dim_x)
+            Means and covariances that `batch_filter` returned, without `update_first`.
+        Fs, Qs : sequence, optional
+            Those that `batch_filter` got.
+        inv : callable, optional
+            As in filterpy.
+        us, Bs : sequence, optional
+            Control inputs that `batch_filter` got, and their matrices; by default ``kf.B``.
+
+        Returns
+        -------
+        x, P, K, Pp : ndarray
+            As in filterpy.
+
+        Raises
+        ------
+        ValueError
+            NaN or Inf, wrong shapes, a fading memory (``alpha``), or no `us` although control inputs moved this filter.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from kfopc_filterpy import KFOPC
+        >>> kf = KFOPC(dim_x=1)
+        >>> kf.H, kf.B, us = [[1.0]], np.array([[1.0]]), [0.0, 5.0, 5.0]
+        >>> means, covariances, _, _ = kf.batch_filter([0.0, 5.0, 10.0], us=us)
+        >>> print(kf.rts_smoother(means, covariances, us=us)[0].ravel())
+        [ 0.  5. 10.]
+        """
+        n, size = len(Xs), self.dim_x  # type: ignore[arg-type]
+        x, P = as_finite_array(Xs, "Xs"), as_finite_array(Ps, "Ps")
+        if x.shape not in ((n, size, 1), (n, size)) or P.shape != (n, size, size):
+            raise ValueError(f"Xs must be (n, {size}[, 1]) and Ps (n, {size}, {size}), got {x.shape} and {P.shape}")
+        if self.alpha != 1.0:
+            raise ValueError(f"alpha must be 1, got {self.alpha:g}: filterpy's smoother leaves the fading memory out")
+        if us is None and self._moved:
+            raise ValueError(
+                "us= is missing: control inputs moved this filter, and filterpy's smoother leaves them out. "
+                "Pass us= and Bs= as to batch_filter, or us=[0] * n if none moved it in these samples"
+            )
+        for name, given in (("Fs", Fs), ("Qs", Qs)):
+            if given is not None:
+                checked_steps.require_matrix(given, (n, size, size), name)
+        smoothed, P, K, Pp = super().rts_smoother(x, P, Fs, Qs, inv)
+        if us is not None:  # the means again, with the inputs
+            F, B = ([own] * n if given is None else given for given, own in ((Fs, self.F), (Bs, self.B)))
+            if not len(us) == len(B) == n:
+                raise ValueError(f"us and Bs must have {n} values, one for each of Xs, got {len(us)} and {len(B)}")
+            smoothed = x.copy()
+            for k in range(n - 1, 0, -1):
+                checked_steps.require_control(self, us[k], B[k])
+                moved = 0.0 if us[k] is None or B[k] is None else np.reshape(np.dot(B[k], us[k]), x[k].shape)
+                smoothed[k - 1] += np.dot(K[k - 1], smoothed[k] - np.dot(F[k], x[k - 1]) - moved)
+        return smoothed, P, K, Pp
+
+    def get_prediction(
+        self,
+        u: ArrayLike | None = None,
+        B: ArrayLike | None = None,
+        F: ArrayLike | None = None,
+        Q: ArrayLike | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return filterpy's `get_prediction`, refusing what `predict` refuses; nothing changes."""
+        u, B, F, Q = checked_steps.checked_prediction(self, u, B, F, Q)
+        x, P = super().get_prediction(u, B, F, Q)
+        if np.shape(x) != np.shape(self.x):
+            raise ValueError(f"x would become {np.shape(x)}, for u of shape {np.shape(u)}")
+        return x, P
 
     def get_update(self, z: ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return filterpy's `get_update` of the measurement scaled by the present factor; nothing changes."""
@@ -525,7 +703,17 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     def log_likelihood_of(self, z: ArrayLike | None) -> float:
         """Return the log-likelihood of the measurement scaled by the present factor; nothing changes."""
+        if z is not None and np.size(z) != len(self.S):
+            raise ValueError(f"z must have {len(self.S)} value(s), as in the last update, got shape {np.shape(z)}")
         return super().log_likelihood_of(None if z is None else self._presently_scaled(z))
+
+    def _presently_scaled(self, z: Any) -> Any:
+        checked_steps.require_unmasked(z)
+        return self._scaled(z, self.constraint_factor)
+
+    @staticmethod
+    def _scaled(z: Any, factor: float) -> Any:
+        return z if factor == 1.0 else factor * np.asarray(z)
 
     @property
     def alpha(self) -> float:
@@ -544,135 +732,50 @@ class KFOPC(KalmanFilter, Checkpointed):
             self._mahalanobis = sqrt(np.dot(np.dot(self.y.T, self.SI), self.y).item())
         return self._mahalanobis
 
-    def __getstate__(self) -> checked_steps.State:
-        """Return the state for a deep copy or a file, without what is made anew when it is needed."""
-        attributes, private = checked_steps.state_of(self)
-        return attributes, private | {"_batch_references": None}
-
-    def __copy__(self) -> Self:
-        """Return a copy that shares no array that a step writes into."""
-        other = object.__new__(type(self))
-        checked_steps.restore(other, self._snapshot())
-        return other
-
-    def _snapshot(self) -> checked_steps.State:
-        """Return the state with copies of what a step writes into."""
-        attributes, private = self.__getstate__()
-        return attributes, private | {name: deepcopy(private[name]) for name in self._written_into}
-
-    def __repr__(self) -> str:
-        if self.dim_x > MOST_STATES_SHOWN:
-            return f"<{type(self).__name__}: {', '.join(self._summary())}>"
-        own = ("rated_power", "constraint_factor", "disturbance_power", "secondary_path_gain")
-        parts = [super().__repr__().replace("KalmanFilter object", f"{type(self).__name__} object")]
-        return "\n".join([*parts, *(f"{name} = {getattr(self, name)}" for name in own)])
-
-    def _summary(self) -> list[str]:
-        """Return the parts of the `repr` of a filter with many states."""
-        parts = [f"dim_x {self.dim_x}", f"dim_z {self.dim_z}", *self._noises()]
-        if self._constraint is not None:
-            first = self._constraint[0] if isinstance(self._constraint, tuple) else self._constraint
-            powers = ", ".join(f"{power:g}" for power in np.ravel(self._constraint.rated_power))
-            parts += [f"rated power {powers}", f"fs {first.fs:g} Hz", f"memory {first.memory_s:g} s"]
-        return [*parts, f"constraint factor {self.constraint_factor:.3g}", f"norm of x {np.linalg.norm(self.x):.3g}"]
-
-    def _noises(self) -> list[str]:
-        """Return the noise variances for the summary, if they are single numbers."""
-        return []
-
     # All or nothing: a step is checked first, and undone if it fails.
-
-    def _next_reference(self, z: Any, reference: Any) -> Any:
-        if reference is None and self._batch_references is not None:
-            reference = self._batch_references.next()
-        return None if z is None or reference is None else self._checked_reference(reference)
-
-    def _checked_reference(self, reference: Any) -> Any:
-        """Return a reference as a number, or several as (I,) if the rated powers are listed for loudspeakers."""
-        one = np.size(reference) == 1 or not isinstance(self._constraint, tuple)
-        return as_number(reference, "reference") if one else as_signal(reference, "reference")
-
-    @staticmethod
-    def _checked_references(references: Any, n_samples: int) -> np.ndarray:
-        """Return the references of a batch, (n_samples,) or (n_samples, I)."""
-        samples = as_real_array(references, "references")
-        if samples.ndim != 2:
-            return as_signal(samples, "references", length=n_samples)
-        if len(samples) != n_samples:
-            raise ValueError(f"references must have {n_samples} values, got shape {samples.shape}")
-        require_finite(samples, "references")
-        return samples
-
-    def _presently_scaled(self, z: Any) -> Any:
-        checked_steps.require_unmasked(z)
-        return self._scaled(z, self.constraint_factor)
-
-    @staticmethod
-    def _scaled(z: Any, factor: float) -> Any:
-        return z if factor == 1.0 else factor * np.asarray(z)
-
-    def _scaled_step(
-        self, step: Callable[..., None], z: Any, *others: Any, H: Any, reference: Any, start: int | None = None
-    ) -> None:
-        """Run `step` on the scaled measurement, then update the powers; an error leaves the filter unchanged."""
-        factor = self.constraint_factor
-        if self._constraint is not None:
-            shared, sample = self._powers_sample(z, self.H if H is None else H, reference)
-            factor = shared.preview(*sample)
-        self._all_or_nothing(step, None, self._scaled(z, factor), *others)
-        if factor != 1.0:  # store z as given, not scaled, in filterpy's shape
-            if start is None:
-                self.z = np.reshape(z, np.shape(self.z)).copy()
-            else:
-                self.z[start : start + np.size(z)] = np.reshape(z, (-1, 1))
-        if self._constraint is not None:
-            shared.advance(*sample)
-
-    def _powers_sample(self, z: Any, H: Any, reference: Any) -> tuple[SharedConstraint, tuple[Any, Any, Any]]:
-        """Return the constraint, and what it takes: measurements, newest filtered references, references."""
-        from ..power.shared_constraint import SharedConstraint
-
-        shared: Any = self._constraint if isinstance(self._constraint, tuple) else SharedConstraint([self._constraint])
-        rows = np.reshape(H, (-1, self.dim_x))
-        if len(rows) != self.dim_z:
-            raise ValueError(f"a rated power needs all dim_z = {self.dim_z} measurements, rows of H, got {len(rows)}")
-        filters = len(shared), 1 if reference is None else np.size(reference)
-        if self.dim_x % (filters[0] * filters[1]):
-            raise ValueError(
-                f"reference must have one sample for each reference, but dim_x = {self.dim_x} states cannot be the "
-                f"control filters of {filters[0]} loudspeaker(s) for {filters[1]} reference(s)"
-            )
-        newest = rows.reshape(self.dim_z, *filters, -1)[..., 0].swapaxes(0, 1)
-        return shared, (z, newest, reference)
-
-    def _take_in_edits(self) -> None:
-        """Check P if it was assigned or written into since the last step, so that other steps do not pay for it."""
-        P = np.asarray(self.P).tobytes()
-        if np.asarray(self.P_post).tobytes() != P and np.asarray(self.P_prior).tobytes() != P:
-            checked_steps.require_semidefinite(self.P, "P")
 
     def _all_or_nothing(self, step: Callable[..., None], checks: checked_steps.Checks | None, *arguments: Any) -> None:
         self._take_in_edits()
         checked_steps.run_or_undo(self, step, arguments, checks)
 
+    def _take_in_edits(self) -> None:
+        """Check P if it was assigned or written into since the last step, so that other steps do not pay for it."""
+        P = np.asarray(self.P).tobytes()
+        if np.asarray(self.P_post).tobytes() != P and np.asarray(self.P_prior).tobytes() != P:
+            self._require_covariance()
 
-class BatchReferences:
-    """Reference samples of a running batch; a copy of the filter, such as `Saver` makes, does not get them."""
+    def _require_covariance(self) -> None:
+        checked_steps.require_semidefinite(self.P, "P")
 
-    def __init__(self, samples: np.ndarray) -> None:
-        self.next = iter(samples.tolist()).__next__
+    def _has_input(self, u: Any, B: Any) -> bool:
+        """Return whether a control input moves the state."""
+        return u is not None and (self.B if B is None else B) is not None and bool(np.any(u))
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> None:
-        return None
+    def _require_whole(self) -> None:
+        """Raise an error if attributes were put back without what steps write in place (`_in_place`).
 
+        A shallow copy of `__dict__` shares that with the filter. So the steps that write are counted twice: before they do
+        in a list, which the copy shares, and afterwards in a number, which it does not.
+        """
+        if self._written[0] != self._writes:
+            raise ValueError(
+                "the attributes of this filter are those of an earlier step, but not its powers and P, which steps write "
+                "in place: put back copy.deepcopy(kf.__dict__), or use copy.copy(kf)"
+            )
 
-class CountingSaver:
-    """Counts the steps of a batch, and saves each with the user's saver."""
+    def _snapshot(self) -> dict[str, Any]:
+        """Return the attributes, with copies of what steps write in place."""
+        return self.__dict__ | {name: deepcopy(self.__dict__[name]) for name in self._in_place}
 
-    def __init__(self, saver: Any) -> None:
-        self.saver, self.steps = saver, 0
+    def _go_back(self, attributes: dict[str, Any]) -> None:
+        """Put back the attributes of a snapshot."""
+        self.__dict__.clear()
+        self.__dict__.update(attributes)
 
-    def save(self) -> None:
-        if self.saver is not None:
-            self.saver.save()
-        self.steps += 1
+    def __repr__(self) -> str:
+        own = ("rated_power", "constraint_factor", "disturbance_power", "secondary_path_gain")
+        if self.dim_x > MOST_STATES_SHOWN:
+            shown = ("dim_x", "dim_z", *own[:2])
+            return f"<{type(self).__name__}: {', '.join(f'{name} {getattr(self, name)}' for name in shown)}>"
+        parts = [super().__repr__().replace("KalmanFilter object", f"{type(self).__name__} object")]
+        return "\n".join([*parts, *(f"{name} = {getattr(self, name)}" for name in own)])

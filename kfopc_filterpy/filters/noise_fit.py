@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_finite_array, as_real_array, require_finite
-from .covariance import as_semidefinite
+from .checked_steps import as_covariance
 
 STEP = 1e-3  # of log-variances, for derivatives: see the notes of `fit_noise`
 COARSE = np.log(10.0) * np.arange(-8, 9, 2)  # factors that are tried first, 1e-8 to 1e8
@@ -191,7 +191,7 @@ class _Record:
             raise ValueError(f"kf.alpha must be 1, got {kf.alpha:g}: a fading memory is no model with a likelihood")
         self.x, self.F = as_finite_array(kf.x, "kf.x").ravel(), as_finite_array(kf.F, "kf.F")
         n = self.x.size
-        self.P = as_semidefinite(kf.P, n, "kf.P")
+        self.P = as_covariance(kf.P, n, "kf.P")
         self.H = np.atleast_2d(as_finite_array(kf.H if H is None else H, "H"))
         if self.F.shape != (n, n) or self.H.ndim > 3 or self.H.shape[-1] != n:
             raise ValueError(
@@ -261,7 +261,7 @@ def _parts(parts: Any, own: Any, size: int, name: str) -> tuple[np.ndarray, np.n
     checked = []
     for i, part in enumerate(given or [own]):
         label = f"kf.{name}" if not given or parts is None else f"{name}_parts[{i}]"
-        matrix = as_semidefinite(part, size, label)
+        matrix = as_covariance(part, size, label)
         if given and not matrix.any():
             raise ValueError(f"{label} must not be zero: no factor changes it; leave it out")
         checked.append(matrix)

@@ -1,50 +1,59 @@
-"""The filter of eq. 1-8, F = I, Q = r I, R = q, one measurement: KFOPC stepped in O(L^2)."""
+"""The filter of eq. 1-8, F = I, Q = r I, R = q, one measurement: KFOPC stepped in O(L^2) by two functions of BLAS."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import isfinite, log, nan, pi, sqrt
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from math import inf, isfinite, sqrt
+from sys import float_info
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.linalg import inv
 from numpy.typing import ArrayLike
+from scipy.linalg.blas import dasum, daxpy, ddot, dsymv, dsyr
 
-from .._validate import as_count, as_nonnegative, as_number
-from ..core.block import LOUD_STEP, NO_SOLUTION
-from ..core.calls import covariance_update
+from .._validate import as_count, as_finite_array, as_nonnegative, as_number, require_finite
 from ..power.constraint import OutputPowerConstraint
 from . import checked_steps
-from .covariance import RandomWalkCovariance, require_covariance
-from .kfopc import KFOPC
+from .checked_steps import FLOAT
+from .kfopc import KFOPC, Assigned
 
-# A filter's variances, and the results of its last update.
-NUMBERS = np.dtype(
-    [(name, np.float64) for name in ("state_noise", "measurement_noise", "measurement", "residual", "variance")]
-)
-
-
-def _made_when_read(name: str, make: Callable[[Any], np.ndarray], description: str) -> Any:
-    """Return a property that is computed from the last update's results, unless it was assigned since."""
-
-    def get(kf: Any) -> Any:
-        if name not in kf._made:
-            assign(kf, make(kf))
-        return kf._made[name]
-
-    def assign(kf: Any, value: Any) -> None:
-        kf._made = {**kf._made, name: value}  # another dictionary: the one before may be kept, to undo a step
-
-    return property(get, assign, doc=description)
+# In rounding errors of the largest variance. For an h of energy 1, an h'P h below BLUR is nothing but rounding. From then
+# on the state noise is at least LEAST_NOISE: without it, rounding would make P indefinite, and each step more so.
+BLUR, LEAST_NOISE = 16 * float_info.epsilon, 2 * float_info.epsilon
+MADE_BY_UPDATE = ("P", "P_post", "K", "S", "SI", "y", "z")
 
 
-class _Identity:
-    """filterpy's `_I`: an identity matrix that is made when it is used, since it is large at many taps."""
+def _as_state(kf: Any, value: ArrayLike, name: str) -> np.ndarray:
+    """Return x as a real array, (n,) or (n, 1)."""
+    x, n = as_finite_array(value, name), kf.dim_x
+    if x.shape not in ((n,), (n, 1)):
+        raise ValueError(f"{name} would become {x.shape}, for {n} states")
+    return x
 
-    def __get__(self, kf: Any, owner: Any = None) -> Any:
-        return self if kf is None else np.eye(kf.dim_x)
 
-    def __set__(self, kf: Any, value: Any) -> None:
-        """Ignore the value."""
+def _as_multiple(kf: Any, value: ArrayLike, name: str) -> np.ndarray:
+    """Return F, Q or R as a matrix, and note whether it is a multiple of the identity; then it cannot be written into."""
+    n, given = 1 if name == "R" else kf.dim_x, as_finite_array(value, name)
+    matrix = given * np.eye(n) if given.ndim == 0 or given.size == n == 1 else np.array(given)
+    checked_steps.require_matrix(matrix, (n, n), name)
+    if name != "F":
+        checked_steps.require_variance(matrix, n, name)
+    multiple = float(matrix[0, 0]) if name != "F" else 1.0
+    plain = np.array_equal(matrix, multiple * np.eye(n))
+    matrix.flags.writeable = not plain
+    kf.__dict__[f"_{name}"] = multiple if plain else None
+    return matrix
+
+
+class _Covariance(cached_property[np.ndarray]):
+    """P: made when it is read after a step, and checked when it is assigned."""
+
+    def __set__(self, kf: Any, value: ArrayLike) -> None:
+        P, n = as_finite_array(value, "P"), kf.dim_x
+        P = P * np.eye(n) if P.ndim == 0 else P  # a number is the variance of every state, as in filterpy's equations
+        checked_steps.require_matrix(P, (n, n), "P")
+        kf.__dict__["P"] = P
 
 
 class RandomWalkKFOPC(KFOPC):
@@ -53,11 +62,10 @@ class RandomWalkKFOPC(KFOPC):
     Made by `KFOPC.random_walk`. To rounding, it behaves like a filterpy `KalmanFilter` with F = I, Q = r I and R = q:
 
     - `F`, `Q` and `R` are returned as read-only arrays. Assign a number to `Q` or `R` to change the noise.
-    - `P` is returned as a full array; editing it in place takes effect at the next step, as in filterpy. A P that is
-      not positive semidefinite is refused, which costs O(L^3), but only when P is assigned or edited.
+    - What is written into `P` counts at the next step, as in filterpy. A `P` that is not symmetric and positive
+      semidefinite is refused then, which costs O(L^3), but only after `P` was assigned or written into.
     - If another F or a full Q is assigned or passed, or with `B` and `u`, or an H of several rows, the step uses
       filterpy's own equations, in O(L^3).
-    - filterpy's fading memory ``alpha`` stays fast.
 
     Parameters
     ----------
@@ -78,14 +86,12 @@ class RandomWalkKFOPC(KFOPC):
     array([[16.]])
     """
 
-    _written_into = (*KFOPC._written_into, "_covariance", "_numbers")
-    _log_likelihood: Any
+    _in_place: ClassVar[tuple[str, ...]] = (*KFOPC._in_place, "_triangle")
 
-    if not TYPE_CHECKING:  # Out of `Saver`'s records, filterpy's own private attributes included.
-        __slots__ = (
-            *("_F", "_K", "_Q", "_alpha_sq", "_covariance", "_delegating", "_likelihood", "_log_likelihood", "_made"),
-            *("_mahalanobis", "_numbers", "_views"),
-        )
+    x: Any = Assigned(_as_state)
+    F: Any = Assigned(_as_multiple)
+    Q: Any = Assigned(_as_multiple)
+    R: Any = Assigned(_as_multiple)
 
     def __init__(
         self,
@@ -98,195 +104,36 @@ class RandomWalkKFOPC(KFOPC):
         constraint: OutputPowerConstraint | None = None,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
-        self._F: np.ndarray | None = None  # None: the identity
-        self._Q: np.ndarray | None = None  # None: state_noise I
-        self._views: dict[str, np.ndarray] = {}  # read-only F, Q, R, made when read
-        self._covariance = RandomWalkCovariance(np.eye(n_taps))
-        self._K: np.ndarray | None = np.zeros((n_taps, 1))  # None: derived from the last update when read
-        self._delegating = False
-        self._numbers = np.array([(0.0, 0.0, 0.0, 0.0, nan)], NUMBERS)
-        self._made: dict[str, Any] = {}  # those of y, z, S, SI and x_prior read or assigned since the last update
         super().__init__(n_taps, 1, rated_power=rated_power, constraint=constraint)
-        self.state_noise = state_noise
-        self.measurement_noise = measurement_noise
+        self.state_noise, self.measurement_noise = state_noise, measurement_noise
         variance = as_nonnegative(initial_variance, "initial_variance")
-        self._covariance = RandomWalkCovariance(variance * np.eye(n_taps))
-
-    def __getstate__(self) -> checked_steps.State:
-        """Return the state for a deep copy or a file, without views (copied views would be writeable)."""
-        attributes, private = super().__getstate__()
-        return attributes, private | {"_views": {}}
-
-    def _noises(self) -> list[str]:
-        state_noise = "full Q" if self.state_noise is None else f"state noise {self.state_noise:g}"
-        return [state_noise, f"measurement noise {self.measurement_noise:g}"]
-
-    # F, Q, R: numbers, read as matrices.
+        # P = scale T + diagonal I, of which T is a symmetric matrix with only its lower triangle
+        self._triangle, self._scale, self._diagonal = variance * np.eye(n_taps), 1.0, 0.0
+        self._bound = variance  # at least the largest variance in P
+        self._blurred = False  # h'P h was nothing but rounding
+        self._predicted = False  # P is P_prior
+        self._gain, self._last = np.zeros(n_taps), (0.0, 0.0, 0.0)  # K of the last update; its z, y and S
+        del self.__dict__["P"]
 
     @property
     def state_noise(self) -> float | None:
         """State noise variance r of eq. 4; None if a full `Q` was assigned."""
-        return float(self._numbers["state_noise"][0]) if self._Q is None else None
+        return self._Q
 
     @state_noise.setter
     def state_noise(self, value: float) -> None:
-        self._numbers["state_noise"] = as_nonnegative(value, "state_noise")
-        self._Q = None
-        self._views.pop("Q", None)
+        self.Q = as_nonnegative(value, "state_noise")
 
     @property
     def measurement_noise(self) -> float:
         """Measurement noise variance q of eq. 7."""
-        return float(self._numbers["measurement_noise"][0])
+        return self._R
 
     @measurement_noise.setter
     def measurement_noise(self, value: float) -> None:
-        self._numbers["measurement_noise"] = as_nonnegative(value, "measurement_noise")
-        self._views.pop("R", None)
-
-    @property
-    def F(self) -> np.ndarray:
-        """State transition, the identity (read-only) unless another was assigned."""
-        return self._view("F", 1.0) if self._F is None else self._F
-
-    @F.setter
-    def F(self, value: ArrayLike) -> None:
-        F = self._matrix(value, "F")
-        self._F = None if np.array_equal(F, np.eye(self.dim_x)) else F
-
-    @property
-    def Q(self) -> np.ndarray:
-        """State noise covariance r I, read-only unless a full one was assigned; assign a number for r."""
-        return self._view("Q", self._numbers["state_noise"][0]) if self._Q is None else self._Q
-
-    @Q.setter
-    def Q(self, value: ArrayLike) -> None:
-        if np.ndim(value) == 0:
-            self.state_noise = as_nonnegative(value, "Q")
-            return
-        Q = self._matrix(value, "Q")
-        if np.diagonal(Q).min() < 0:
-            raise ValueError("Q must not have negative variances on its diagonal")
-        if np.array_equal(Q, Q[0, 0] * np.eye(self.dim_x)):
-            self.state_noise = Q[0, 0]
-        else:
-            self._Q = Q
-
-    @property
-    def R(self) -> np.ndarray:
-        """Measurement noise variance q as (1, 1), read-only; assign a number to change it."""
-        return self._view("R", self._numbers["measurement_noise"][0], size=1)
-
-    @R.setter
-    def R(self, value: ArrayLike) -> None:
-        if np.size(value) != 1:
-            raise ValueError(f"R must be one variance, got shape {np.shape(value)}")
-        self.measurement_noise = as_nonnegative(value, "R")
-
-    def _view(self, name: str, value: float, size: int | None = None) -> np.ndarray:
-        if name not in self._views:
-            self._views[name] = value * np.eye(self.dim_x if size is None else size)
-            self._views[name].flags.writeable = False
-        return self._views[name]
-
-    def _matrix(self, value: Any, name: str) -> np.ndarray:
-        matrix = np.array(value, dtype=np.float64)
-        checked_steps.require_matrix(matrix, (self.dim_x, self.dim_x), name)
-        return matrix
-
-    _I = _Identity()
-
-    # P and the values that follow from it, computed when read.
-
-    @property
-    def P(self) -> np.ndarray:
-        """State covariance, a full symmetric array; values written into it take effect at the next step."""
-        return self._covariance.show()
-
-    @P.setter
-    def P(self, value: ArrayLike) -> None:
-        # as in filterpy's equations, a number is the variance of every state
-        given: Any = value
-        P = self._matrix(given * np.eye(self.dim_x) if np.ndim(given) == 0 else given, "P")
-        if not self._delegating:  # the rounding of filterpy's own equations need not be small beside P
-            require_covariance(P)
-        self._replace_covariance(P)
-
-    def _replace_covariance(self, P: np.ndarray) -> None:
-        self._K = self.K  # compute it before the arrays that it derives from are replaced
-        self._covariance = self._covariance.replaced(P)
-
-    @property
-    def P_prior(self) -> np.ndarray:
-        """P(n|n-1) of the last prediction, a fresh array."""
-        return self._covariance.full(self._covariance.prior)
-
-    @P_prior.setter
-    def P_prior(self, value: np.ndarray) -> None:
-        self._covariance.prior = np.array(value, dtype=np.float64)
-
-    @property
-    def P_post(self) -> np.ndarray:
-        """P(n|n) of the last update, a fresh array."""
-        return self._covariance.full(self._covariance.posterior)
-
-    @P_post.setter
-    def P_post(self, value: np.ndarray) -> None:
-        self._covariance.posterior = np.array(value, dtype=np.float64)
-
-    @property
-    def K(self) -> np.ndarray:
-        """Kalman gain of the last update, (n, 1)."""
-        if self._K is None:  # eq. 6, K = P x' / S
-            u, S = self._covariance.direction, self._numbers["variance"][0]
-            self._K = (u / sqrt(S) if S > 0 else np.zeros_like(u)).reshape(-1, 1)
-        return self._K
-
-    @K.setter
-    def K(self, value: np.ndarray) -> None:
-        self._K = value
-
-    y = _made_when_read("y", lambda kf: kf._as_measured("residual"), "Residual of the last update, alpha z - H x.")
-    z = _made_when_read("z", lambda kf: kf._as_measured("measurement"), "Measurement of the last update, unscaled.")
-    S = _made_when_read("S", lambda kf: kf._numbers["variance"].reshape(1, 1).copy(), "Innovation variance, (1, 1).")
-    SI = _made_when_read("SI", lambda kf: 1.0 / kf.S, "Inverse of S.")
-    x_prior = _made_when_read("x_prior", lambda kf: kf._before_update(), "State before the last update.")
-
-    @property
-    def log_likelihood(self) -> float:
-        """Log-likelihood of the last measurement; of a single one in closed form."""
-        if self._log_likelihood is None and self.S.shape == (1, 1) and self.S[0, 0] > 0:
-            y, S = self.y.item(), self.S.item()
-            self._log_likelihood = -0.5 * (log(2.0 * pi * S) + y * y / S)
-        return super().log_likelihood
-
-    def _as_measured(self, name: str) -> np.ndarray:
-        value = self._numbers[name]
-        return value.reshape((1,) * np.ndim(self.x)).copy()
-
-    def _before_update(self) -> np.ndarray:
-        return self.x_post - (self.K * self._numbers["residual"][0]).reshape(np.shape(self.x_post))
-
-    def _take_in_edits(self) -> None:
-        """Apply what was written into an array that `P` returned."""
-        edited = self._covariance.edited()
-        if edited is not None:
-            self.P = edited
+        self.R = as_nonnegative(value, "measurement_noise")
 
     # The steps.
-
-    def _all_or_nothing(self, step: Callable[..., None], checks: checked_steps.Checks | None, *arguments: Any) -> None:
-        """Run filterpy's own equations, which see P, F, Q as full arrays."""
-        self._take_in_edits()
-        before = checked_steps.state_of(self)
-        try:
-            self._replace_covariance(self._covariance.full(self._covariance.now))
-            self._delegating = True
-            checked_steps.run_or_undo(self, step, arguments, checks)
-            self._delegating = False
-        except BaseException:
-            checked_steps.restore(self, before)
-            raise
 
     def predict(
         self,
@@ -296,18 +143,25 @@ class RandomWalkKFOPC(KFOPC):
         Q: ArrayLike | None = None,
     ) -> None:
         """Apply eq. 2 and 4; a full F or Q, or B with u, uses filterpy's own equations. See `KFOPC.predict`."""
-        # batch_filter passes F and Q as they are read
-        F = self._F if F is None or F is self._views.get("F") else F
-        Q = self._Q if Q is None or Q is self._views.get("Q") else Q
-        moved = u is not None and (self.B if B is None else B) is not None
-        if moved or F is not None or (Q is not None and np.ndim(Q) != 0):
-            super().predict(u, B, F, self._numbers["state_noise"][0] if Q is None else Q)
+        self._look_at_copies()
+        noise = self._Q if Q is None else as_nonnegative(Q, "Q") if np.ndim(Q) == 0 else None
+        if noise is None or F is not None or self._F is None or self._has_input(u, B):
+            super().predict(u, B, F, Q)
             return
-        state_noise = self._numbers["state_noise"][0] if Q is None else as_nonnegative(Q, "Q")
         self._take_in_edits()
-        x = self._weights()
-        self._covariance.predict(self._alpha_sq, state_noise)
-        self.x, self.x_prior = x, x.copy()
+        if not isfinite(dasum(self.x)):
+            require_finite(self.x, "x")
+        fading, bound = self._alpha_sq, self._bound
+        if not isfinite(fading * bound + noise):
+            bound = self._largest_variance()
+            if not isfinite(fading * bound + noise):
+                raise ValueError(f"P would overflow with Q = {noise:g}, alpha^2 = {fading:g}. Nothing was changed")
+        # eq. 4: P(n|n-1) = P(n-1|n-1) + r I, which the update applies; the fading memory is filterpy's
+        self._scale, self._diagonal = fading * self._scale, fading * self._diagonal + noise
+        self._bound, self._predicted = fading * bound + noise, True
+        self._forget("P", "P_prior")
+        self.__dict__["x"] = self.x.copy()  # eq. 2
+        self.x_prior = self.x.copy()
 
     def update(
         self,
@@ -318,70 +172,146 @@ class RandomWalkKFOPC(KFOPC):
         reference: ArrayLike | None = None,
     ) -> None:
         """Apply eq. 5-9; an H of several rows, or another `inv`, uses filterpy's own equations. See `KFOPC.update`."""
-        if isinstance(z, np.ma.MaskedArray) and z.size == 1:  # several are left to `KFOPC.update`
-            z, R, H, _ = checked_steps.without_masked(self, z, R, H)
-        row: Any = self.H if H is None else H
-        measurement: Any
-        own_inverse = self.inv is not np.linalg.inv
-        if z is not None and (own_inverse or np.size(row) != self.dim_x):
+        plain = self._plain(z, R, H)
+        if plain is None:
             super().update(z, R, H, reference=reference)
             return
-        reference = self._next_reference(z, reference)
+        d, noise, h = plain
+        self._require_whole()
         self._take_in_edits()
-        if z is None:
-            self._covariance.missed()
-            self._record(self.x)
-            self.y, self.z = np.zeros((1, 1)), np.array([[None]])
-            return
-        plain = R is None and type(z) is float and type(row) is np.ndarray and row.dtype == np.float64
-        if plain and row.shape in ((self.dim_x,), (1, self.dim_x)):  # fast path: the usual types in a loop over samples
-            measurement, noise, h = z, self._numbers["measurement_noise"][0], np.ascontiguousarray(row).reshape(-1)
-        else:
-            measurement, noise, h = self._checked(z, R, row)
-        weights = self._corrected(measurement, noise, h, reference)
-        self._record(weights)
-        if measurement is not z:
-            self.z = np.array(z).reshape(self.y.shape)
-
-    def _checked(self, z: Any, R: Any, row: Any) -> tuple[float, float, np.ndarray]:
-        """Return z, R and H as numbers and (n,), or raise a clear error."""
-        R = None if R is self._views.get("R") else R
-        z, _, _ = checked_steps.checked_measurement(self, z, R, row)
-        noise = self.measurement_noise if R is None else as_nonnegative(R, "R")
-        return float(np.asarray(z).reshape(())), noise, np.array(row, dtype=np.float64).reshape(-1)
-
-    def _corrected(self, z: float, noise: float, h: np.ndarray, reference: Any) -> np.ndarray:
-        """Apply eq. 5-9; return the new weights. A refused update raises before anything changes."""
-        constraint, covariance = self._constraint, self._covariance
-        seen = covariance.seen
-        x = np.asarray(self.x)
-        if x.size != self.dim_x:
-            self._weights()  # raises
-        seen.weights[:], seen.row[:] = x.reshape(-1), h
-        if not isfinite(z + np.vdot(h, h) + np.vdot(seen.weights, seen.weights)):
-            self._weights()  # raises if one of them is not finite
-            checked_steps.checked_measurement(self, z, None, h)
-        factor = self._unconstrained_factor if constraint is None else constraint.preview(z, h[0], reference)
-        if noise == 0.0 and not h.any():
-            raise ValueError(checked_steps.SILENT_REFERENCE)
-        before, prior = covariance.before_update()
-        result = covariance.result
-        result[1] = nan
-        answer = covariance_update(*seen.places, factor * z, noise, seen.result)
-        y, S = result.tolist()
-        if S == S:  # the pass over P has begun
-            covariance.projected(before, prior)
-        if answer == LOUD_STEP:
-            raise ValueError(f"the weights would overflow: x = {self.x!r}, z = {z:g}, S = {S:g}. Nothing was changed")
-        if answer == NO_SOLUTION:
-            cause = "P is not positive definite on H" if S <= 0 else "it overflows"
+        T, x, constraint = self._triangle, self.x, self._constraint
+        energy = ddot(h, h)
+        if not isfinite(d + energy):
+            checked_steps.checked_measurement(self, d, None, h)  # raises unless only the energy overflows
+        factor = self._unconstrained_factor
+        if constraint is not None:  # eq. 10-13
+            self._require_other_row(h)
+            factor = constraint.preview(d, h[0], reference)
+        elif reference is not None:
+            self._checked_reference(reference)
+        diagonal, bound, blurred = self._diagonal, self._bound, self._blurred
+        if blurred:
+            diagonal = max(diagonal, LEAST_NOISE * self._largest_variance())
+        u = dsymv(self._scale, T.T, h, diagonal, h)  # P(n|n-1) x'
+        variance = ddot(h, u)
+        if variance < BLUR * energy * bound < inf:
+            bound = self._largest_variance()  # which `bound` may exceed by far
+            lost = BLUR * energy * bound
+            blurred = blurred or variance < lost
+            if variance < 0.0 or variance + noise < lost:  # the sample tells nothing
+                u, variance = np.zeros_like(h), max(lost - noise, 0.0)
+        S = variance + noise  # eq. 7
+        if not float_info.min <= S < inf:
+            if noise == 0.0 and not h.any():
+                raise ValueError(checked_steps.SILENT_REFERENCE)
+            cause = "it overflows" if S > 1.0 else "P is not positive definite on H, or 1/S overflows"
             raise ValueError(f"S = H P H' + R must be positive, got {S:g}: {cause}. Nothing was changed")
+        y = factor * d - ddot(h, x)  # eq. 9
+        K = u / S  # eq. 6
+        weights = daxpy(K, x.copy(), a=y)  # eq. 5
+        if not isfinite(dasum(weights)) and not np.isfinite(weights).all():
+            require_finite(x, "x")
+            raise ValueError(f"the weights would overflow: x = {x!r}, z = {d:g}, S = {S:g}. Nothing was changed")
+        if not self._predicted:
+            _ = self.P_prior  # of which P is another one by now: kept as it is
+        self._written[0] += 1
+        if self._scale != 1.0:
+            T *= self._scale
+        T.reshape(-1)[:: self.dim_x + 1] += diagonal
+        self._triangle = dsyr(-1.0 / S, u, a=T.T, overwrite_a=1).T  # eq. 8
         if constraint is not None:
-            constraint.advance(z, h[0], reference)
-        covariance.updated()
-        self._K, self._made = None, {name: value for name, value in self._made.items() if name == "x_prior"}
-        self._numbers["measurement"], self._numbers["residual"], self._numbers["variance"] = z, y, S
-        return seen.weights.reshape(x.shape).copy()
+            constraint.accept()
+            self._note_row(h)
+        self._forget(*MADE_BY_UPDATE)
+        if self._predicted:
+            self._forget("P_prior")
+        self._scale, self._diagonal, self._bound, self._blurred, self._predicted = 1.0, 0.0, bound, blurred, False
+        self._gain, self._last = K, (d, y, S)
+        self.__dict__["x"], self.x_post = weights, weights.copy()
+        self._log_likelihood = self._likelihood = self._mahalanobis = None
+        self._writes += 1
+
+    def _plain(self, z: Any, R: Any, H: Any) -> tuple[float, float, np.ndarray] | None:
+        """Return z, R and H as numbers and (n,); None for a missed sample, several rows of H or another `inv`."""
+        n, row = self.dim_x, self.H if H is None else H
+        self._look_at_copies()
+        if isinstance(z, np.ma.MaskedArray) and z.size == 1:
+            z = None if np.ma.is_masked(z) else z.data
+        if z is None or self.inv is not inv or np.size(row) != n:
+            return None
+        usual_z = isinstance(z, float) or (type(z) is np.ndarray and z.dtype == FLOAT and z.shape in ((), (1,), (1, 1)))
+        usual_H = type(row) is np.ndarray and row.dtype == FLOAT and row.shape in ((n,), (1, n))
+        if not usual_z or not usual_H or R is not None:
+            z, _, _ = checked_steps.checked_measurement(self, z, R, row)
+        noise = self._R if R is None else as_nonnegative(R, "R")
+        return float(np.asarray(z).item()), noise, np.ascontiguousarray(row, FLOAT).reshape(n)
+
+    # What follows from T and the last update: made when it is read, and then kept until the next step.
+
+    def _full(self, scale: float, diagonal: float) -> np.ndarray:
+        """Return scale T + diagonal I as a full symmetric array."""
+        self._require_whole()
+        P = np.tril(self._triangle)
+        P += np.tril(P, -1).T
+        P *= scale
+        P.reshape(-1)[:: self.dim_x + 1] += diagonal
+        return P
+
+    def _largest_variance(self) -> float:
+        return self._scale * float(self._triangle.reshape(-1)[:: self.dim_x + 1].max()) + self._diagonal
+
+    P: Any = _Covariance(lambda kf: kf._full(kf._scale, kf._diagonal))
+
+    @cached_property
+    def P_prior(self) -> np.ndarray:
+        """P(n|n-1) of the last prediction."""
+        if self._predicted:
+            return self._full(self._scale, self._diagonal)
+        u = self._gain * sqrt(self._last[2])
+        return self._full(1.0, 0.0) + np.outer(u, u)
+
+    @cached_property
+    def P_post(self) -> np.ndarray:
+        """P(n|n) of the last update."""
+        return self._full(1.0, 0.0)
+
+    @cached_property
+    def K(self) -> np.ndarray:
+        """Kalman gain of the last update, (n, 1) (eq. 6)."""
+        return self._gain.reshape(-1, 1).copy()
+
+    z = cached_property(lambda kf: np.full((1,) * kf.x_post.ndim, kf._last[0]))
+    y = cached_property(lambda kf: np.full((1,) * kf.x_post.ndim, kf._last[1]))
+    S = cached_property(lambda kf: np.full((1, 1), kf._last[2]))
+    SI = cached_property(lambda kf: 1.0 / kf.S)
+
+    @property
+    def _read(self) -> None:
+        """Make all of them: filterpy's `Saver` reads the properties for that before it copies the attributes."""
+        for name in ("P_prior", *MADE_BY_UPDATE):
+            getattr(self, name)
+
+    def _forget(self, *names: str) -> None:
+        for name in names:
+            self.__dict__.pop(name, None)
+
+    def _take_in_edits(self) -> None:
+        """Take over a P that was written into or assigned since the last step."""
+        P = self.__dict__.get("P")
+        if P is not None and not np.array_equal(P, self._full(self._scale, self._diagonal)):
+            _ = self.P_prior, self.P_post  # of the P before
+            super()._take_in_edits()
+            self._triangle, self._scale, self._diagonal = np.array(P), 1.0, 0.0
+            self._bound, self._predicted = self._largest_variance(), False
+
+    def _require_covariance(self) -> None:
+        checked_steps.as_covariance(self.P, self.dim_x, "P")
+
+    def _look_at_copies(self) -> None:
+        """Take F, Q and R anew from matrices that can be written into: those of a copy of the filter."""
+        for name in ("F", "Q", "R"):
+            if self.__dict__[name].flags.writeable:
+                setattr(self, name, self.__dict__[name])
 
     def _own_constraint(self, value: Any) -> OutputPowerConstraint:
         """Return a copy of a constraint; there is one loudspeaker."""
@@ -395,15 +325,3 @@ class RandomWalkKFOPC(KFOPC):
     def _checked_reference(self, reference: Any) -> float:
         """Return a reference as a number; there is one."""
         return as_number(reference, "reference")
-
-    def _weights(self) -> np.ndarray:
-        """Return x as a new array of its shape."""
-        weights = np.array(self.x, dtype=np.float64)
-        # A finite sum of squares is quick to compute and implies finite weights. If it overflows, check each weight.
-        if weights.size != self.dim_x or not (isfinite(np.vdot(weights, weights)) or np.isfinite(weights).all()):
-            raise ValueError(f"x must have {self.dim_x} finite values, got shape {np.shape(self.x)}: {self.x!r}")
-        return weights
-
-    def _record(self, x: np.ndarray) -> None:
-        self._log_likelihood = self._likelihood = self._mahalanobis = None
-        self.x, self.x_post = x, x.copy()

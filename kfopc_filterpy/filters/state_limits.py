@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_finite_array, as_positive, as_real_array
-from .covariance import as_semidefinite
+from .checked_steps import as_covariance
 
 ROUNDING = 1e-12  # eigenvalues of a correlation matrix, and slopes of limits, below this are taken as zero
 KEPT = 1e-9  # how well linear limits are kept, in the unit of `_in_deviations`
@@ -100,7 +100,7 @@ def constrained(
     n = estimate.size
     if estimate.shape not in ((n,), (n, 1)):
         raise ValueError(f"kf.x must have shape (n,) or (n, 1), got {estimate.shape}")
-    P = as_semidefinite(kf.P, n, "kf.P")
+    P = as_covariance(kf.P, n, "kf.P")
     centre, deviations = estimate.ravel(), np.sqrt(np.diagonal(P))
     D, d = _in_deviations(*_rows(equalities, n, "equalities"), centre, deviations)
     A, b = _in_deviations(*_all_inequalities(inequalities, lower, upper, n), centre, deviations)
@@ -176,7 +176,7 @@ def _checked_power(power: Any, n: int) -> tuple[np.ndarray, float]:
     """Return the matrix M and the limit rho of x' M x <= rho."""
     if not isinstance(power, tuple | list) or len(power) != 2:
         raise TypeError(f"power must be a pair of a matrix ({n}, {n}) and a limit, got {type(power).__name__}")
-    return as_semidefinite(power[0], n, "power[0]"), as_positive(power[1], "power[1]")
+    return as_covariance(power[0], n, "power[0]"), as_positive(power[1], "power[1]")
 
 
 def _on_equalities(G: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

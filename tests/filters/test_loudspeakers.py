@@ -148,7 +148,6 @@ def test_batches_are_the_steps_and_the_constraints_are_the_filters_own() -> None
         steps.update(z[n], H=rows[n], reference=x[n])
     np.testing.assert_array_equal(kf.x, steps.x)
     assert kf.constraint_factor == steps.constraint_factor
-    assert "rated power 0.5, 2, fs 16000 Hz" in repr(made())
 
 
 FAULTS: dict[str, tuple[Callable[[KFOPC], Any], type[Exception], str]] = {

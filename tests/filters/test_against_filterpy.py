@@ -1,0 +1,370 @@
+"""filterpy's filter and ours take the same steps in any order: one machine, whose oracle is filterpy's own KalmanFilter.
+
+The general filter equals it in every bit. The random walk, which sums in another order, agrees to 1e-9 of the largest
+value: the rounding of some ten steps times the condition of these problems, whose variances are 0.1 to 1000.
+"""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable
+from math import sqrt
+from typing import Any
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from kfopc_filterpy import KFOPC
+
+FILTERPY_2 = hasattr(KalmanFilter, "update_sequential")  # 1.4.5 has none
+STATE = ("x", "P", "x_prior", "P_prior", "x_post", "P_post", "K", "y", "S", "SI")
+OTHERS = ("F", "Q", "R", "H", "M", "alpha")
+LIKELIHOODS = ("log_likelihood", "likelihood", "mahalanobis")
+CLOSE = 1e-9
+OTHER_UPDATES = ["update_correlated", "update_steadystate"]
+USES = ["", "", "look", "hold", "write into what is held", "P[0, 0]", "P[0, 1]", "P *=", "x[0]", "x +="]
+USES += [f"assign {name}" for name in ("x", "P", "H", "R", "F", "Q", "alpha")]
+seeds = st.integers(0, 2**32 - 1)
+
+
+class Oracle(KalmanFilter):
+    """filterpy's filter, with the `mahalanobis` of 2.0.0 (1.4.5's raises on numpy 2)."""
+
+    @property
+    def mahalanobis(self) -> float:
+        return sqrt(np.dot(np.dot(self.y.T, self.SI), self.y).item())
+
+
+def covariance(rng: np.random.Generator, n: int) -> np.ndarray:
+    root = rng.normal(size=(n, n))
+    return root @ root.T / n + 0.1 * np.eye(n)
+
+
+def transition(rng: np.random.Generator, n: int) -> np.ndarray:
+    F = rng.normal(size=(n, n))
+    return 0.95 * F / np.abs(np.linalg.eigvals(F)).max()
+
+
+class Twins(RuleBasedStateMachine):
+    """Both filters. A rule draws numbers with one seed, so that each filter can be given arrays of its own."""
+
+    oracle: Any
+    ours: Any
+    held: list[tuple[np.ndarray, np.ndarray]]  # arrays of both that a user has kept
+    moved = False  # by a control input
+
+    def begin(self, ours: Any, n: int, m: int, k: int, x_ndim: int, seed: int) -> None:
+        self.oracle, self.ours, self.held = Oracle(n, m, k), ours, []
+
+        def system(kf: Any, rng: np.random.Generator) -> None:
+            kf.x, kf.H = rng.normal(size=(n, 1)[:x_ndim]), rng.normal(size=(m, n))
+            kf.P, kf.R = covariance(rng, n), covariance(rng, m)
+            # 1.4.5 makes M (m, m). So small that 20 updates leave P positive: filterpy would go on with a negative one.
+            kf.M = 1e-3 * rng.normal(size=(n, m)) / n
+            for name, value in self.model(rng).items():
+                setattr(kf, name, value)
+
+        self.both(seed, system)
+
+    def both(self, seed: int, action: Callable[[Any, np.random.Generator], Any]) -> list[Any]:
+        return [action(kf, np.random.default_rng(seed)) for kf in (self.oracle, self.ours)]
+
+    def require_same(self, expected: Any, got: Any, what: str) -> None:
+        if isinstance(expected, tuple):
+            for one, other in zip(expected, got, strict=True):
+                self.require_same(one, other, what)
+            return
+        assert np.shape(got) == np.shape(expected), what
+        self.compare(expected, got, what)
+
+    def compare(self, expected: Any, got: Any, what: str) -> None:
+        assert type(got) is type(expected), what
+        np.testing.assert_array_equal(got, expected, err_msg=what)
+
+    def query(self, seed: int, action: Callable[[Any, np.random.Generator], Any], what: str) -> None:
+        self.require_same(*self.both(seed, action), what)
+
+    # What each kind of machine says: a system, and arguments of the steps.
+
+    def shape(self) -> tuple[int, int, int, int]:
+        """States, measurements, control inputs, axes of x."""
+        kf = self.oracle
+        return kf.dim_x, kf.dim_z, kf.dim_u, np.ndim(kf.x)
+
+    def z(self, rng: np.random.Generator, form: int = 0) -> Any:
+        """A measurement as a column, or in another form that filterpy takes."""
+        _, m, _, x_ndim = self.shape()
+        z = rng.normal(size=(m, 1))
+        forms = [z, z.ravel(), z.reshape(1, m), z.ravel().tolist()]
+        if m == 1:
+            forms += [z.item(), np.float64(z.item()), np.array(z.item()), int(9 * z.item()), np.float32(z.item())]
+        return forms[form % len(forms)] if form else z.reshape((m, 1)[:x_ndim])
+
+    # A sample: a prediction and a correction of any form, and between them what a user does with the filter.
+
+    @rule(
+        seed=seeds,
+        prediction=st.sampled_from(["", "", "", "none", "F", "Q", "number Q", "u", "u and B", "steady"]),
+        between=st.sampled_from(USES),
+        correction=st.sampled_from(
+            ["", "", "", "none", "H", "H", "R", "number R", "H and R", "missed", *OTHER_UPDATES]
+        ),
+        form=st.integers(0, 12),
+        after=st.sampled_from(USES),
+    )
+    def sample(self, seed: int, prediction: str, between: str, correction: str, form: int, after: str) -> None:
+        if prediction != "none":
+            self.predict(seed, prediction)
+        self.use(between, seed)
+        if correction != "none":
+            self.correct(seed, correction, form)
+        self.use(after, seed)
+
+    def predict(self, seed: int, form: str) -> None:
+        n, _, k, x_ndim = self.shape()
+
+        def step(kf: Any, rng: np.random.Generator) -> None:
+            u, B = rng.normal(size=(k, 1)[:x_ndim]), rng.normal(size=(n, k))
+            arguments = {
+                "F": {"F": transition(rng, n)},
+                "Q": {"Q": covariance(rng, n)},
+                "number Q": {"Q": 0.3},
+                "u": {"u": u},
+                "u and B": {"u": u, "B": B},
+            }
+            kf.B = B if form == "u" else None
+            kf.predict_steadystate(u, B) if form == "steady" else kf.predict(**arguments.get(form, {}))
+            kf.B = None
+
+        self.both(seed, step)
+        self.moved = self.moved or form in ("u", "u and B", "steady")
+
+    def correct(self, seed: int, correction: str, form: int) -> None:
+        n, m, _, _ = self.shape()
+
+        def step(kf: Any, rng: np.random.Generator) -> None:
+            if correction in OTHER_UPDATES:
+                getattr(kf, correction)(None if form == 12 else self.z(rng, form))
+                return
+            # filterpy 2.0.0 does not reshape z if H is passed
+            z, H, R = self.z(rng, 0 if "H" in correction else form), rng.normal(size=(m, n)), covariance(rng, m)
+            arguments = {"H": H} if "H" in correction else {}
+            if "R" in correction:
+                arguments["R"] = 0.4 if "number" in correction else R
+            kf.update(None if correction == "missed" else z, **arguments)
+
+        self.both(seed, step)
+
+    @rule(seed=seeds, masked=st.integers(1, 3))
+    def mask(self, seed: int, masked: int) -> None:
+        """The rows that are left correct filterpy's filter, to rounding; then it goes on from the same state."""
+        _, m, _, x_ndim = self.shape()
+        rng = np.random.default_rng(seed)
+        z, there = rng.normal(size=m), np.arange(m) != masked - 1
+        there[:] = there & there.any()
+        self.ours.update(np.ma.array(np.where(there, z, np.nan), mask=~there))
+        oracle = copy.deepcopy(self.oracle)
+        if not there.any():
+            self.oracle.update(None)
+            return
+        oracle.dim_z = there.sum()
+        oracle.update(z[there].reshape((-1, 1)[:x_ndim]), R=oracle.R[np.ix_(there, there)], H=oracle.H[there])
+        for name in ("x", "P", *LIKELIHOODS):
+            np.testing.assert_allclose(
+                getattr(self.ours, name), getattr(oracle, name), rtol=1e-10, atol=1e-10, err_msg=name
+            )
+        np.testing.assert_array_equal(np.ravel(self.ours.z), np.where(there, z, np.nan))
+        assert not self.ours.y[~there].any()
+        assert not self.ours.K[:, ~there].any()
+        for name in STATE:
+            setattr(self.oracle, name, np.copy(getattr(self.ours, name)))
+        self.oracle._log_likelihood = self.oracle._likelihood = None
+        self.ours._log_likelihood = self.ours._likelihood = self.ours._mahalanobis = None
+        self.oracle.z = self.ours.z
+
+    @precondition(lambda self: FILTERPY_2 and np.ndim(self.oracle.x) == 2)
+    @rule(seed=seeds, number=st.booleans())
+    def update_sequentially(self, seed: int, number: bool) -> None:
+        """filterpy writes into z, which must have the rows of all measurements by then."""
+        n, m, _, _ = self.shape()
+        start = seed % m
+
+        def step(kf: Any, rng: np.random.Generator) -> None:
+            kf.update(None)
+            if number:
+                kf.update_sequential(start, rng.normal())
+            else:
+                kf.update_sequential(start, rng.normal(size=m - start), R_i=0.3, H_i=rng.normal(size=(m - start, n)))
+
+        self.both(seed, step)
+        self.held = []  # filterpy writes into x
+
+    @rule(
+        seed=seeds, update_first=st.booleans(), given=st.sets(st.sampled_from(["Qs", "Hs", "Rs", "inputs", "missing"]))
+    )
+    def batch_and_smooth(self, seed: int, update_first: bool, given: set[str]) -> None:
+        n, m, k, x_ndim = self.shape()
+        steps = 4
+
+        def batch(kf: Any, rng: np.random.Generator) -> tuple[Any, ...]:
+            lists = {
+                "Qs": [covariance(rng, n) for _ in range(steps)],
+                "Hs": [rng.normal(size=(m, n)) for _ in range(steps)],
+                "Rs": [covariance(rng, m) for _ in range(steps)],
+                "us": [rng.normal(size=(k, 1)[:x_ndim]) for _ in range(steps)],
+                "Bs": [rng.normal(size=(n, k)) for _ in range(steps)],
+            }
+            zs = [self.z(rng) for _ in range(steps)]
+            if "missing" in given:
+                zs[1] = None
+            lists = {
+                name: value
+                for name, value in lists.items()
+                if name in given or ("inputs" in given and name in ("us", "Bs"))
+            }
+            found = kf.batch_filter(np.fromiter(zs, object), **lists, update_first=update_first)
+            if kf.alpha == 1.0 and not self.moved:
+                found += kf.rts_smoother(*found[:2], Qs=lists.get("Qs"))
+            return found
+
+        self.moved = self.moved or "inputs" in given
+        self.query(seed, batch, "batch")
+
+    # What a user assigns, writes into, holds and copies.
+
+    def use(self, how: str, seed: int) -> None:
+        if how == "look":
+            self.look()
+        elif how == "hold":
+            self.held += [(self.oracle.P, self.ours.P), (self.oracle.x, self.ours.x)]
+        elif how == "write into what is held" and self.held:  # it counts if there was no step since, and only then
+            for array in self.held[seed % len(self.held)]:
+                array *= 1.5
+        else:
+            self.both(seed, lambda kf, rng: self.write(kf, rng, how))
+
+    def write(self, kf: Any, rng: np.random.Generator, how: str) -> None:
+        n, m, _, x_ndim = self.shape()
+        if how == "P[0, 0]":
+            kf.P[0, 0] += 1.0
+        elif how == "P[0, 1]":
+            kf.P[0, -1] = kf.P[-1, 0] = 0.5 * np.sqrt(kf.P[0, 0] * kf.P[-1, -1])
+            kf.P[np.diag_indices(n)] *= n  # so it stays positive definite
+            kf.P /= n
+        elif how == "P *=":
+            kf.P *= 3.0 if kf.P[0, 0] < 100.0 else 0.1
+        elif how == "x[0]":
+            kf.x[0] = 1.0
+        elif how == "x +=":
+            kf.x += 1.0
+        elif how.startswith("assign"):
+            values = {
+                "x": rng.normal(size=(n, 1)[:x_ndim]),
+                "P": covariance(rng, n),
+                "H": rng.normal(size=(m, n)),
+                "R": covariance(rng, m),
+                "alpha": 1.0 + 0.01 * rng.integers(2),
+            } | self.model(rng)
+            setattr(kf, how.split()[1], values[how.split()[1]])
+
+    def model(self, rng: np.random.Generator) -> dict[str, Any]:
+        n = self.oracle.dim_x
+        return {"F": transition(rng, n), "Q": covariance(rng, n)}
+
+    @rule(how=st.sampled_from([copy.copy, copy.deepcopy, lambda kf: pickle.loads(pickle.dumps(kf)), "__dict__"]))
+    def go_on_in_a_copy(self, how: Any) -> None:
+        if how == "__dict__":
+            attributes = copy.deepcopy(vars(self.ours))
+            self.ours.predict()
+            self.ours.update(None)
+            self.ours.update(self.z(np.random.default_rng(0)))
+            vars(self.ours).clear()
+            vars(self.ours).update(attributes)
+        else:
+            before, self.ours = self.ours, how(self.ours)
+            before.predict()
+            before.update(self.z(np.random.default_rng(0)))
+            before.x[:] = before.P[:] = 7.0
+        self.oracle, self.held = copy.deepcopy(self.oracle), []
+
+    # Refusals, and what changes nothing.
+
+    @rule(fault=st.sampled_from(["z", "z size", "H", "R", "Q", "F", "P", "batch", "x"]))
+    def refuse(self, fault: str) -> None:
+        n, m, _, _ = self.shape()
+        kf, good = self.ours, self.z(np.random.default_rng(0))
+        x, P = kf.x, kf.P
+        faults: dict[str, Callable[[], Any]] = {
+            "z": lambda: kf.update(np.full((m, 1), np.nan)),
+            "z size": lambda: kf.update(np.ones(m + 1)),
+            "H": lambda: kf.update(good, H=np.full((m, n), np.inf)),
+            "R": lambda: kf.update(good, R=-1.0),
+            "Q": lambda: kf.predict(Q=-1.0),
+            "F": lambda: kf.predict(F=np.eye(n + 1)),
+            "P": lambda: (setattr(kf, "P", -np.eye(n)), kf.update(good)),
+            "batch": lambda: kf.batch_filter([good, good, np.full((m, 1), np.inf)]),
+            "x": lambda: (setattr(kf, "x", np.full(x.shape, np.nan)), kf.predict()),
+        }
+        with pytest.raises(ValueError, match=r"[A-Za-z]+ .*(must|would)"):
+            faults[fault]()
+        if fault in "xP":
+            kf.x, kf.P = x, P
+
+    @rule(seed=seeds)
+    def ask(self, seed: int) -> None:
+        n, _, k, x_ndim = self.shape()
+        arguments = {"u": np.ones((k, 1)[:x_ndim]), "B": np.ones((n, k))} if seed % 2 or not FILTERPY_2 else {}
+        self.query(seed, lambda kf, _: kf.get_prediction(**arguments), "get_prediction")  # 1.4.5's needs B
+        self.query(seed, lambda kf, rng: kf.get_update(self.z(rng)), "get_update")
+        self.query(seed, lambda kf, rng: kf.residual_of(self.z(rng)), "residual_of")
+        self.query(seed, lambda kf, _: kf.measurement_of_state(kf.x), "measurement_of_state")
+        if np.any(self.oracle.S):
+            self.query(seed, lambda kf, rng: kf.log_likelihood_of(self.z(rng)), "log_likelihood_of")
+            for name in LIKELIHOODS:
+                self.require_same(getattr(self.oracle, name), getattr(self.ours, name), name)
+
+    @invariant()
+    def same_x(self) -> None:
+        self.require_same(self.oracle.x, self.ours.x, "x")
+
+    def look(self) -> None:
+        """Not after each step: what is read may change what the next one does."""
+        for name in (*STATE, *OTHERS):
+            self.require_same(getattr(self.oracle, name), getattr(self.ours, name), name)
+        np.testing.assert_array_equal(np.array(self.ours.z, float), np.array(self.oracle.z, float))
+
+    def teardown(self) -> None:
+        if hasattr(self, "ours"):
+            self.look()
+
+
+class General(Twins):
+    @initialize(n=st.integers(1, 5), m=st.integers(1, 3), k=st.integers(1, 2), x_ndim=st.integers(1, 2), seed=seeds)
+    def start(self, n: int, m: int, k: int, x_ndim: int, seed: int) -> None:
+        self.begin(KFOPC(n, m, k), n, m, k, x_ndim, seed)
+
+
+class RandomWalk(Twins):
+    @initialize(n=st.integers(1, 9), x_ndim=st.integers(1, 2), seed=seeds)
+    def start(self, n: int, x_ndim: int, seed: int) -> None:
+        ours = KFOPC.random_walk(n, state_noise=1.0, measurement_noise=1.0)
+        self.begin(ours, n, 1, 1, x_ndim, seed)
+
+    def model(self, rng: np.random.Generator) -> dict[str, Any]:
+        n, other = self.oracle.dim_x, rng.random() < 0.1
+        return {"F": transition(rng, n) if other else np.eye(n), "Q": covariance(rng, n) if other else 0.01 * np.eye(n)}
+
+    def compare(self, expected: Any, got: Any, what: str) -> None:
+        scale = max(np.abs(expected).max(), 1.0)
+        np.testing.assert_allclose(got, expected, rtol=0, atol=CLOSE * scale, err_msg=what)
+
+
+TestGeneral, TestRandomWalk = General.TestCase, RandomWalk.TestCase
+TestGeneral.settings = TestRandomWalk.settings = settings(
+    max_examples=150, stateful_step_count=20, report_multiple_bugs=False
+)
