@@ -28,6 +28,9 @@ from . import (
 from . import (
     signals as signals,
 )
+from . import (
+    verdict as verdict,
+)
 from .bounds.power_constrained import power_constrained_wiener as power_constrained_wiener
 from .bounds.settings import suggest_settings as suggest_settings
 from .controllers.band_limited import BandLimitedFxLMS as BandLimitedFxLMS

@@ -92,6 +92,23 @@ def test_public_names_resolve_and_are_listed_once(namespace):
         assert not hides, f"importing {name}.py would put the module in place of the name"
 
 
+def test_every_public_folder_is_an_attribute_and_a_misspelt_name_says_what_was_meant():
+    package = importlib.import_module("kfopc_filterpy")
+    folders = {stub.parent.name for stub in (ROOT / "kfopc_filterpy").glob("*/__init__.pyi")}
+    assert folders == {part for part in PARTS if (ROOT / "kfopc_filterpy" / part).is_dir()}
+    assert all(inspect.ismodule(getattr(package, name)) and name in package.__all__ for name in folders)
+    for wrong, meant in {
+        "KFOCP": "KFOPC",
+        "kf_obc": "kf_opc",
+        "constraned": r"kfopc_filterpy\.filters\.constrained",
+    }.items():
+        with pytest.raises(AttributeError, match=rf"has no attribute '{wrong}'; did you mean {meant}\?"):
+            getattr(package, wrong)
+    with pytest.raises(AttributeError, match=r"has no attribute 'nothing_like_it'$"):
+        _ = package.nothing_like_it
+    assert not hasattr(package, "_repr_html_")
+
+
 def test_the_package_never_imports_the_comparisons_and_its_wheel_has_none_of_them():
     wheel = tomllib.loads(read("pyproject.toml"))["tool"]["hatch"]["build"]["targets"]["wheel"]
     assert wheel["packages"] == ["kfopc_filterpy"]
