@@ -119,7 +119,7 @@ def mean_table(rows: Sequence[LossRow]) -> Table:
 
 def loss_table(rows: Sequence[LossRow]) -> Table:
     """Return a line for each case: the losses, and what is left."""
-    headings = ["path", "noise", *(f"{name}, dB" for name in STAGES), "left, dB", "bound with windows of 100 ms, dB"]
+    headings = ["path", "noise", *(f"{name}, dB" for name in STAGES), "left, dB", "bound, 100 ms, dB"]
     return Table(
         "losses",
         "Noise reduction lost at each stage, in dB; a negative loss is a gain",

@@ -98,8 +98,8 @@ def test_claims_from_rows_made_by_hand() -> None:
         *(row("gain", 0.0, name, EXACT) for name in ("KF-ANC", "KF-PB")),
         row("gain", 12.0, "KF-ANC", EXACT, noise_reduction_db=4.0),
         row("gain", -12.0, "KF-PB", EXACT, noise_reduction_db=5.5, power=0.98),
-        row("delay", 4.0, "KF-OPC", EXACT, diverged_at_s=1.0),
+        *(row("delay", amount, "KF-OPC", EXACT, diverged_at_s=1.0) for amount in (4.0, 7.0)),
     ]
     claims = mismatch.claims(rows)
-    assert [claim.value for claim in claims] == pytest.approx([6.0, -np.inf, 6.0, 0.5, 2.0, 0.5, 1, 0.98, 1.0])
+    assert [claim.value for claim in claims] == pytest.approx([6.0, -np.inf, 6.0, 0.5, 2.0, 0.5, 2, 0.98, 1.0])
     assert [k for k, claim in enumerate(claims) if not claim.holds] == [3, 4, 6]
