@@ -27,7 +27,7 @@ OTHERS = ("F", "Q", "R", "H", "M", "alpha")
 LIKELIHOODS = ("log_likelihood", "likelihood", "mahalanobis")
 CLOSE = 1e-9
 OTHER_UPDATES = ["update_correlated", "update_steadystate"]
-USES = ["", "", "look", "hold", "write into what is held", "P[0, 0]", "P[0, 1]", "P *=", "x[0]", "x +="]
+USES = ["", "look", "look", "P[0, 0]", "P[0, 1]", "P *=", "x[0]", "x[0]"]
 USES += [f"assign {name}" for name in ("x", "P", "H", "R", "F", "Q", "alpha")]
 seeds = st.integers(0, 2**32 - 1)
 
@@ -55,11 +55,10 @@ class Twins(RuleBasedStateMachine):
 
     oracle: Any
     ours: Any
-    held: list[tuple[np.ndarray, np.ndarray]]  # arrays of both that a user has kept
     moved = False  # by a control input
 
     def begin(self, ours: Any, n: int, m: int, k: int, x_ndim: int, seed: int) -> None:
-        self.oracle, self.ours, self.held = Oracle(n, m, k), ours, []
+        self.oracle, self.ours = Oracle(n, m, k), ours
 
         def system(kf: Any, rng: np.random.Generator) -> None:
             kf.x, kf.H = rng.normal(size=(n, 1)[:x_ndim]), rng.normal(size=(m, n))
@@ -109,6 +108,7 @@ class Twins(RuleBasedStateMachine):
 
     @rule(
         seed=seeds,
+        kept=st.sampled_from(["", "", "x", "P"]),
         prediction=st.sampled_from(["", "", "", "none", "F", "Q", "number Q", "u", "u and B", "steady"]),
         between=st.sampled_from(USES),
         correction=st.sampled_from(
@@ -117,12 +117,18 @@ class Twins(RuleBasedStateMachine):
         form=st.integers(0, 12),
         after=st.sampled_from(USES),
     )
-    def sample(self, seed: int, prediction: str, between: str, correction: str, form: int, after: str) -> None:
+    def sample(
+        self, seed: int, kept: str, prediction: str, between: str, correction: str, form: int, after: str
+    ) -> None:
+        """What is written into an array that was kept from before counts if no step was taken since, and only then."""
+        held = [getattr(kf, kept) for kf in (self.oracle, self.ours)] if kept else []
         if prediction != "none":
             self.predict(seed, prediction)
         self.use(between, seed)
         if correction != "none":
             self.correct(seed, correction, form)
+        for array in held:
+            array *= 1.5
         self.use(after, seed)
 
     def predict(self, seed: int, form: str) -> None:
@@ -202,7 +208,6 @@ class Twins(RuleBasedStateMachine):
                 kf.update_sequential(start, rng.normal(size=m - start), R_i=0.3, H_i=rng.normal(size=(m - start, n)))
 
         self.both(seed, step)
-        self.held = []  # filterpy writes into x
 
     @rule(
         seed=seeds, update_first=st.booleans(), given=st.sets(st.sampled_from(["Qs", "Hs", "Rs", "inputs", "missing"]))
@@ -240,11 +245,6 @@ class Twins(RuleBasedStateMachine):
     def use(self, how: str, seed: int) -> None:
         if how == "look":
             self.look()
-        elif how == "hold":
-            self.held += [(self.oracle.P, self.ours.P), (self.oracle.x, self.ours.x)]
-        elif how == "write into what is held" and self.held:  # it counts if there was no step since, and only then
-            for array in self.held[seed % len(self.held)]:
-                array *= 1.5
         else:
             self.both(seed, lambda kf, rng: self.write(kf, rng, how))
 
@@ -260,8 +260,6 @@ class Twins(RuleBasedStateMachine):
             kf.P *= 3.0 if kf.P[0, 0] < 100.0 else 0.1
         elif how == "x[0]":
             kf.x[0] = 1.0
-        elif how == "x +=":
-            kf.x += 1.0
         elif how.startswith("assign"):
             values = {
                 "x": rng.normal(size=(n, 1)[:x_ndim]),
@@ -290,7 +288,7 @@ class Twins(RuleBasedStateMachine):
             before.predict()
             before.update(self.z(np.random.default_rng(0)))
             before.x[:] = before.P[:] = 7.0
-        self.oracle, self.held = copy.deepcopy(self.oracle), []
+        self.oracle = copy.deepcopy(self.oracle)
 
     # Refusals, and what changes nothing.
 
