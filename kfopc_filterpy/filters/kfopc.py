@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from ..power.shared_constraint import SharedConstraint
     from .random_walk import RandomWalkKFOPC
 
-MOST_STATES_SHOWN = 8  # with more, `repr` is a summary: filterpy's shows every matrix
 EQUAL_ROWS = 10  # steps in which H may be the same: the reference of noise control changes from sample to sample
 TRACKER = (
     "a rated power scales what weights drive an actuator with, and H has the newest reference samples. This filter tracks "
@@ -223,12 +222,14 @@ class KFOPC(KalmanFilter, Checkpointed):
         """
         from .random_walk import RandomWalkKFOPC
 
-        noises = {
-            "state_noise": state_noise,
-            "measurement_noise": measurement_noise,
-            "initial_variance": initial_variance,
-        }
-        return RandomWalkKFOPC(n_taps, **noises, rated_power=rated_power, constraint=constraint)
+        return RandomWalkKFOPC(
+            n_taps,
+            state_noise=state_noise,
+            measurement_noise=measurement_noise,
+            initial_variance=initial_variance,
+            rated_power=rated_power,
+            constraint=constraint,
+        )
 
     # The steps.
 
@@ -774,8 +775,5 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     def __repr__(self) -> str:
         own = ("rated_power", "constraint_factor", "disturbance_power", "secondary_path_gain")
-        if self.dim_x > MOST_STATES_SHOWN:
-            shown = ("dim_x", "dim_z", *own[:2])
-            return f"<{type(self).__name__}: {', '.join(f'{name} {getattr(self, name)}' for name in shown)}>"
         parts = [super().__repr__().replace("KalmanFilter object", f"{type(self).__name__} object")]
         return "\n".join([*parts, *(f"{name} = {getattr(self, name)}" for name in own)])

@@ -101,7 +101,7 @@ class Twins(RuleBasedStateMachine):
         z = rng.normal(size=(m, 1))
         forms = [z, z.ravel(), z.reshape(1, m), z.ravel().tolist()]
         if m == 1:
-            forms += [z.item(), np.float64(z.item()), np.array(z.item()), int(9 * z.item()), np.float32(z.item())]
+            forms += [z.item(), np.float64(z.item()), np.array(z.item()), int(9 * z.item()), np.float32(z.item()), True]
         return forms[form % len(forms)] if form else z.reshape((m, 1)[:x_ndim])
 
     # A sample: a prediction and a correction of any form, and between them what a user does with the filter.
