@@ -46,8 +46,7 @@ REASONS = reasons()
 class _Plan(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_int32) for name in ("scenarios", "microphones", "loudspeakers", "references")),
-        *((name, ctypes.c_int32) for name in ("taps", "path_taps")),
-        *((name, ctypes.c_int32) for name in ("guard_taps", "limited", "modelled")),
+        *((name, ctypes.c_int32) for name in ("taps", "path_taps", "guard_taps", "modelled")),
         *((name, ctypes.c_void_p) for name in ("power_windows", "limiter_windows", "path", "guard", "settings")),
     ]
 
@@ -64,6 +63,7 @@ class _Algorithm(ctypes.Structure):
     _fields_ = [
         ("name", ctypes.c_char_p),
         ("settings", ctypes.POINTER(_Setting)),
+        ("unfiltered", ctypes.c_int32),
         *((name, ctypes.c_void_p) for name in ("layout", "start", "control_signal", "update", "listen")),
     ]
 
@@ -145,7 +145,7 @@ class Shape:
 def _plan_of(shape: Shape, arrays: dict[str, np.ndarray]) -> _Plan:
     counts = {name: value for name, value in asdict(shape).items() if isinstance(value, int)}
     pointers = {name: array.ctypes.data if array.size else None for name, array in arrays.items()}
-    return _Plan(**counts, limited=bool(shape.limiter_windows), **pointers)
+    return _Plan(**counts, **pointers)
 
 
 class InUse:

@@ -1,92 +1,105 @@
-/* KF-PB: a posterior of the plant, the control filter of least expected error, and one price of power a loudspeaker.
+/* KF-PB: a posterior of the plant, the control filter of least expected error, and one price of
+ * power a loudspeaker.
  *
  *     y = v * x            asked of the loudspeakers
  *     e = p * x - s * y    heard by the microphones, and noise
  *
- * After every block of B samples, the posterior of p and s takes the block (posterior.c). Then the filter of each loudspeaker in
- * turn becomes the one of least expected error at the price of its power, (A + price R) v = b: A is the correlation of its
- * filtered references, R that of the references, b theirs with what the others leave of the disturbance. N = L + M - 1 taps
- * of a primary path are all that control can reach; `lags` is L + N. C_ab(l) = E[a(t) b(t - l)]. */
+ * After every block of B samples, the posterior of p and s takes the block (posterior.c). Then the
+ * filter of each loudspeaker in turn becomes the one of least expected error at the price of its
+ * power, (A + price R) v = b: A is the correlation of its filtered references, R that of the
+ * references, b theirs with what the others leave of the disturbance. N = L + M - 1 taps of a
+ * primary path are all that control can reach; `lags` is L + N. C_ab(l) = E[a(t) b(t - l)]. */
 #include "posterior.h"
-#include <string.h>
 
 enum { RATED_POWER, BLOCK, AVERAGING, WINDOW, SPREAD };
-static const anc_setting budget_settings[] = {
-    {"rated_power", 1e-30f, 0, ANC_EACH_LOUDSPEAKER}, {"block", 1, 65536, ANC_ONE}, {"averaging", 20, 100000, ANC_ONE},
-    {"window", 0, 1, ANC_ONE}, {"spread", 0, 1000, ANC_ONE}, {0}};
+static const anc_setting budget_settings[] = {{"rated_power", 1e-30f, 0, ANC_EACH_LOUDSPEAKER},
+                                              {"block", 1, 65536, ANC_ONE},
+                                              {"averaging", 20, 100000, ANC_ONE},
+                                              {"window", 0, 1, ANC_ONE},
+                                              {"spread", 0, 1000, ANC_ONE},
+                                              {0}};
 
-static const real ACCOUNT = 0.25f;    /* the price falls to (1 - ACCOUNT)^16 = 0.01 of itself if nothing of the account is spent */
-static const real WORTHWHILE = 0.5f; /* a rating of power must save at least this share of the noise */
-static const real NEAR = (real)0.005;/* of the power that a price is to yield */
-static const real LEAST_SHARE = (real)0.02; /* of the account, that a filter may always spend */
-static const real MOST = (real)1.04; /* of the account, that is never exceeded: what goes beyond it is clipped */
-enum { SCALES = 3, TWICE = 2 };       /* what lasted t may go on for twice as long */
-enum { SHORTEST = 20 };               /* ... and for a twentieth of the averaging time */
-/* t: exponential windows of the averaging time over these. The filter is solved for the references of the first. */
+/* If nothing of the account is spent, the price falls to (1 - ACCOUNT)^16 = 0.01 of itself. */
+static const real ACCOUNT = 0.25f;
+/* A rating of power must save at least this share of the noise. */
+static const real WORTHWHILE = 0.5f;
+/* Of the power that a price is to yield. */
+static const real NEAR = (real)0.005;
+/* Shares of the account: what a filter may always spend; what is never exceeded, but clipped. */
+static const real LEAST_SHARE = (real)0.02, MOST = (real)1.04;
+/* What lasted t may go on for twice as long, and for at least a twentieth of the averaging time. */
+enum { SCALES = 3, TWICE = 2, SHORTEST = 20 };
+/* t: exponential windows of the averaging time over these. The filter is solved for the references
+ * of the first. */
 static const int32_t SCALE[SCALES + 1] = {8, 100, 40, 4};
-enum { NEWTON = 20 };                 /* steps */
-/* No filter has a larger tap. REGULAR: share of the diagonal that is added to it, so that rounding leaves the matrix definite. */
+enum { NEWTON = 20 }; /* steps */
+/* No filter has a larger tap. REGULAR: share of the diagonal that is added to it, so that rounding
+ * leaves the matrix definite. */
 #ifdef ANC_FLOAT
 static const real LARGEST_TAP = 1e6f, REGULAR = 1e-5f, LEAST_POWER = 1e-30f;
 #else
 static const real LARGEST_TAP = 1e50, REGULAR = 1e-7, LEAST_POWER = 1e-300;
 #endif
 
-
 typedef struct {
     signals s;
     posterior posterior;
-    int32_t T, lags;             /* blocks of the account */
-    real *asked;                 /* (3, J) now; sum of squares of the block; the most that this sum may become */
-    int32_t *controlled;         /* whether control was on in the block */
-    real *R, *short_R;           /* (I, I, lags), (SCALES, I, I, L) windowed sums of x_i(t) x_a(t - l) */
-    real *weight;                /* (1 + SCALES) of these windows */
-    real *book;                  /* (T, J) power of each block over the rating, newest first */
-    real *price, *steady;        /* (J); (2, J) the price that spends the rating, and that price as it is held */
-    real *C;                     /* (I, I, 2 lags - 1) of the references, both signs of l */
-    real *A;                     /* (J, I, J, I, 2L - 1) of the filtered references */
-    real *b;                     /* (J, I, L) of these with d */
-    real *sums;                  /* (I, I, 2L - 1) A + price R of one loudspeaker */
-    real *predictors;            /* (L rows of I, I, 1 to L) see `factorise` */
-    real *forward;               /* (I, I, L) */
-    real *small;                 /* (L + 6, I, I) see `factorise` */
-    real *vectors;               /* (VECTORS_OF_TAPS, I, L) */
-    real *work;                  /* (WORKS, width) */
+    int32_t T, lags;       /* T: blocks of the account */
+    real *asked;           /* (3, J) now; sum of squares of the block; the most it may become */
+    int32_t *controlled;   /* whether control was on in the block */
+    real *R, *short_R;     /* (I, I, lags), (SCALES, I, I, L) windowed sums of x_i(t) x_a(t - l) */
+    real *weight;          /* (1 + SCALES) of these windows */
+    real *book;            /* (T, J) power of each block over the rating, newest first */
+    real *price, *steady;  /* (J); (2, J) the price that spends the rating, and as it is held */
+    real *C;               /* (I, I, 2 lags - 1) of the references, both signs of l */
+    real *A;               /* (J, I, J, I, 2L - 1) of the filtered references */
+    real *b;               /* (J, I, L) of these with d */
+    real *sums;            /* (I, I, 2L - 1) A + price R of one loudspeaker */
+    real *predictors;      /* (L rows of I, I, 1 to L) see `factorise` */
+    real *forward, *small; /* (I, I, L), (L + 6, I, I) see `factorise` */
+    real *vectors;         /* (VECTORS_OF_TAPS, I, L) */
+    real *work;            /* (WORKS, width) */
     int32_t width;
 } budget;
+typedef char budget_fits_into_a_view[sizeof(budget) <= sizeof(anc_view) ? 1 : -1];
 
 enum { REST, SOLUTION, PLAYED, VECTORS_OF_TAPS };
 enum { WORKS = SCALES + 2 };
 
 /* Layout. */
 
-/* Return whether the algorithm takes the plan, so that all products of counts below fit into an int32. */
+/* Return whether the algorithm takes the plan, so that all products of counts below fit into an
+ * int32. */
 static int takes(const anc_plan *p, real block, real averaging)
 {
-    const double most = 1 << 28, K = p->microphones, J = p->loudspeakers, I = p->references, L = p->taps, M = p->path_taps;
-    const double N = L + M - 1, n = I * N + J * M, B = block, T = averaging;
-    if (p->guard_taps || p->scenarios != 1 || !(B >= 1 && B <= 65536 && T >= 20 && T <= 100000)) return 0;
-    return n <= 1 << 14 && K * n <= most && J * T <= most && J * J * I * I * 2 * L <= most && (I + J + K) * (2 * L + M + B) <= most &&
-           I * I * L * L <= most && I * I * 5 * (L + N) <= most && K * J * M <= most && J * J * 2 * M <= most && I * J * 2 * N <= most;
+    const double most = 1 << 28, B = block, T = averaging;
+    const double K = p->microphones, J = p->loudspeakers, I = p->references;
+    const double L = p->taps, M = p->path_taps, N = L + M - 1, n = I * N + J * M;
+    if (p->guard_taps || p->scenarios != 1) return 0;
+    if (!(B >= 1 && B <= 65536 && T >= 20 && T <= 100000 && n <= 1 << 14)) return 0;
+    return K * n <= most && J * T <= most && J * J * I * I * 2 * L <= most &&
+           (I + J + K) * (2 * L + M + B) <= most && I * I * L * L <= most &&
+           I * I * 5 * (L + N) <= most && K * J * M <= most && J * J * 2 * M <= most &&
+           I * J * 2 * N <= most;
 }
 
-static void layout_budget(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
+static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
 {
-    typedef char fits_into_a_view[sizeof(budget) <= sizeof(anc_view) ? 1 : -1];
     budget *f = (budget *)view;
     signals *s = &f->s;
     const int32_t J = plan->loudspeakers;
     const real *own = plan->settings ? plan->settings + J : NULL; /* after the rated powers */
-    const real block = own ? own[BLOCK - 1] : 1, averaging = own ? own[AVERAGING - 1] : (real)SHORTEST;
-    (void)sizeof(fits_into_a_view);
+    const real block = own ? own[BLOCK - 1] : 1,
+               averaging = own ? own[AVERAGING - 1] : (real)SHORTEST;
     if (!takes(plan, block, averaging)) {
         at->size = SIZE_MAX;
         return;
     }
-    layout_unfiltered(s, plan, settings, at);
     layout_posterior(&f->posterior, s, (int32_t)block, !own || own[SPREAD - 1] == 0, at);
     const int32_t I = s->I, L = s->L, N = f->posterior.N, lags = L + N;
-    f->T = (int32_t)averaging, f->lags = lags, f->width = 2 * lags + f->posterior.B;
+    f->T = (int32_t)averaging;
+    f->lags = lags;
+    f->width = 2 * lags + f->posterior.B;
     f->asked = reals(at, "asked", ANC_STATE, 1, 1, 3, J);
     f->controlled = int32s(at, "controlled", ANC_STATE, 1);
     f->R = reals(at, "reference_correlation", ANC_STATE, 1, I, I, lags);
@@ -106,11 +119,11 @@ static void layout_budget(anc_view *view, const anc_plan *plan, const anc_settin
     f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, WORKS, f->width);
 }
 
-/* Return what loudspeaker j has spent in the blocks of the account, in blocks of the rating. */
-static real spent_by(const budget *f, int32_t j)
+/* Return what loudspeaker j has spent in the newest n blocks, in blocks of the rating. */
+static real spent_by(const budget *f, int32_t j, int32_t n)
 {
     real spent = 0;
-    for (int32_t t = 0; t < f->T; t++) spent += f->book[times(t, f->s.J) + (size_t)j];
+    for (int32_t t = 0; t < n; t++) spent += f->book[times(t, f->s.J) + (size_t)j];
     return spent;
 }
 
@@ -118,58 +131,64 @@ static real spent_by(const budget *f, int32_t j)
 static void set_room(budget *f)
 {
     const int32_t J = f->s.J;
-    for (int32_t j = 0; j < J; j++)
-        f->asked[2 * J + j] = larger(MOST * (real)f->T - spent_by(f, j), 0) * (real)f->posterior.B * f->s.setting[RATED_POWER][j];
+    for (int32_t j = 0; j < J; j++) {
+        const real left = larger(MOST * (real)f->T - spent_by(f, j, f->T), 0);
+        f->asked[2 * J + j] = left * (real)f->posterior.B * f->s.setting[RATED_POWER][j];
+    }
 }
 
-static void start_budget(anc_view *view, const anc_plan *plan, const anc_setting *settings)
+static void start_budget(anc_view *view)
 {
     budget *f = (budget *)view;
-    start_signals(&f->s, plan, settings);
     start_posterior(&f->posterior, *f->s.setting[SPREAD]);
     for (size_t n = 0; n < times(f->T, f->s.J); n++) f->book[n] = 1; /* spent before the start */
     set_room(f);
 }
 
 static real *work_row(const budget *f, int32_t row) { return f->work + times(row, f->width); }
-static real *taps_of(const budget *f, int32_t number) { return f->vectors + times(number, f->s.I * f->s.L); }
+static real *taps_of(const budget *f, int32_t number)
+{
+    return f->vectors + times(number, f->s.I * f->s.L);
+}
 
-/* Toeplitz systems. The blocks of a matrix are given by their lags, (I, I, 2L - 1) at some stride: T(l)_ic, l from 1 - L up,
- * is the block m - l = that lag to the right of the diagonal. T(-l) = T(l)'. */
+/* Toeplitz systems. The blocks of a matrix are given by their lags, (I, I, 2L - 1) at some stride:
+ * T(l)_ic, l from 1 - L up, is the block m - l = that lag to the right of the diagonal. T(-l) =
+ * T(l)'. */
 
 typedef struct {
     budget *f;
     const real *A, *R; /* at lag 1 - L of their first elements */
     size_t next_A, row_A, next_R, row_R;
-    const real *b;     /* (I, L) */
+    const real *b; /* (I, L) */
     real scale;
 } toeplitz_system;
 
 /* Set to_i = sum_c T_ic v_c. */
-static void multiply_toeplitz(const budget *f, real *to, const real *T, size_t row, size_t next, const real *v)
+static void multiply_toeplitz(const budget *f, real *to, const real *T, size_t row, size_t next,
+                              const real *v)
 {
     const int32_t I = f->s.I, L = f->s.L;
     real *part = work_row(f, 0);
-    memset(to, 0, sizeof(real) * times(I, L));
+    clear(to, times(I, L));
     for (int32_t i = 0; i < I; i++)
         for (int32_t c = 0; c < I; c++) {
             real *restrict sums = to + times(i, L);
-            correlate(part, v + times(c, L), L, T + row * (size_t)i + next * (size_t)c, L); /* from the last tap to the first */
+            /* from the last tap to the first */
+            correlate(part, v + times(c, L), L, T + row * (size_t)i + next * (size_t)c, L);
             for (int32_t l = 0; l < L; l++) sums[l] += part[L - 1 - l];
         }
 }
 
-/* Factorise the lower triangle of a small matrix, I by I, in place, with the inverse of the diagonal in its place. Return 0 if
- * it is not positive definite. */
+/* Factorise the lower triangle of a small matrix, I by I, in place, with the inverse of the
+ * diagonal in its place. Return 0 if it is not positive definite. */
 static int factorise_small(real *C, int32_t I)
 {
     for (int32_t i = 0; i < I; i++)
         for (int32_t c = 0; c <= i; c++) {
             real sum = C[i * I + c];
             for (int32_t k = 0; k < c; k++) sum -= C[i * I + k] * C[c * I + k];
-            if (c < i) C[i * I + c] = sum * C[c * I + c];
-            else if (!(sum > 0 && isfinite(sum))) return 0;
-            else C[i * I + i] = 1 / root(sum);
+            if (c == i && !(sum > 0 && isfinite(sum))) return 0;
+            C[i * I + c] = c < i ? sum * C[c * I + c] : 1 / root(sum);
         }
     return 1;
 }
@@ -191,53 +210,79 @@ static void backward_small(const real *C, real *z, int32_t I, int32_t stride)
     }
 }
 
+/* Solve C C' z = z for a column of a matrix. */
+static void solve_small(const real *C, real *z, int32_t I)
+{
+    forward_small(C, z, I, I);
+    backward_small(C, z, I, I);
+}
+
 /* The backward predictor B of order m, (I, I, m + 1). */
-static real *predictor_of(const budget *f, int32_t m) { return f->predictors + times(f->s.I, f->s.I) * (times(m, m + 1) / 2); }
+static real *predictor_of(const budget *f, int32_t m)
+{
+    return f->predictors + times(f->s.I, f->s.I) * (times(m, m + 1) / 2);
+}
+
 static real *factor_of(const budget *f, int32_t m) { return f->small + times(m, f->s.I * f->s.I); }
+
+/* Set the sums to T = A + price R, and start Whittle's recursion with order 0. */
+static void start_recursion(const toeplitz_system *t, real price, real *D, real *E)
+{
+    const budget *f = t->f;
+    const int32_t I = f->s.I, L = f->s.L, lags = 2 * L - 1;
+    for (int32_t i = 0; i < I; i++)
+        for (int32_t c = 0; c < I; c++) {
+            const real *A = t->A + t->row_A * (size_t)i + t->next_A * (size_t)c;
+            const real *R = t->R + t->row_R * (size_t)i + t->next_R * (size_t)c;
+            real *restrict T = f->sums + times(i * I + c, lags);
+            for (int32_t l = 0; l < lags; l++) T[l] = A[l] + price * R[l];
+            if (i == c) T[L - 1] = A[L - 1] * (1 + REGULAR) + price * R[L - 1];
+            /* A reference that is silent, or that nobody hears: its filter is zero. */
+            if (i == c && T[L - 1] == 0) T[L - 1] = 1;
+            D[i * I + c] = E[i * I + c] = T[L - 1];
+            f->forward[times(i * I + c, L)] = i == c;
+            predictor_of(f, 0)[i * I + c] = i == c;
+        }
+}
 
 /* Factorise T = A + price R by Whittle's recursion; return 0 if it is not positive definite.
  *
- * For the first m + 1 blocks T_m of T: T_m B_m = [0, ..., 0, E], T_m F = [D, 0, ..., 0], where the last block of B_m and the
- * first of F are 1. So T^-1 = sum_m B_m E_m^-1 B_m'. With Delta = sum_k T(k - m - 1) F_k:
- *     F  = [F, 0] - [0, B] E^-1 Delta      D = D - Delta' E^-1 Delta
- *     B  = [0, B] - [F, 0] D^-1 Delta'     E = E - Delta D^-1 Delta'                                        */
+ * For the first m + 1 blocks T_m of T: T_m B_m = [0, ..., 0, E], T_m F = [D, 0, ..., 0], where the
+ * last block of B_m and the first of F are 1. So T^-1 = sum_m B_m E_m^-1 B_m'. With Delta = sum_k
+ * T(k - m - 1) F_k: F  = [F, 0] - [0, B] E^-1 Delta      D = D - Delta' E^-1 Delta B  = [0, B] -
+ * [F, 0] D^-1 Delta'     E = E - Delta D^-1 Delta' */
 static int factorise(const toeplitz_system *t, real price)
 {
     const budget *f = t->f;
     const int32_t I = f->s.I, L = f->s.L, lags = 2 * L - 1, square = I * I;
-    real *D = factor_of(f, L), *E = D + square, *Delta = E + square, *P = Delta + square, *Q = P + square;
+    real *D = factor_of(f, L), *E = D + square, *Delta = E + square;
+    real *P = Delta + square, *Q = P + square; /* E^-1 Delta, D^-1 Delta' */
     real *F = f->forward, *B = predictor_of(f, 0);
-    for (int32_t i = 0; i < I; i++)
-        for (int32_t c = 0; c < I; c++) {
-            const real *A = t->A + t->row_A * (size_t)i + t->next_A * (size_t)c, *R = t->R + t->row_R * (size_t)i + t->next_R * (size_t)c;
-            real *restrict T = f->sums + times(i * I + c, lags);
-            for (int32_t l = 0; l < lags; l++) T[l] = A[l] + price * R[l];
-            if (i == c) T[L - 1] = A[L - 1] * (1 + REGULAR) + price * R[L - 1];
-            if (i == c && T[L - 1] == 0) T[L - 1] = 1; /* a reference that is silent, or that nobody hears: its filter is zero */
-            D[i * I + c] = E[i * I + c] = T[L - 1];
-            F[times(i * I + c, L)] = B[i * I + c] = i == c;
-        }
+    start_recursion(t, price, D, E);
     for (int32_t m = 0;; m++) {
         real *C = factor_of(f, m), *next = predictor_of(f, m + 1);
-        memcpy(C, E, sizeof(real) * (size_t)square);
+        copy(C, E, (size_t)square);
         if (!factorise_small(C, I)) return 0;
         if (m == L - 1) return 1;
         for (int32_t i = 0; i < I; i++)
             for (int32_t c = 0; c < I; c++) {
                 real sum = 0;
-                for (int32_t k = 0; k < I; k++) sum += dot(f->sums + times(i * I + k, lags) + (L - 2 - m), F + times(k * I + c, L), m + 1);
+                for (int32_t k = 0; k < I; k++) {
+                    const real *T = f->sums + times(i * I + k, lags) + (L - 2 - m);
+                    sum += dot(T, F + times(k * I + c, L), m + 1);
+                }
                 Delta[i * I + c] = P[i * I + c] = Q[c * I + i] = sum;
             }
-        for (int32_t c = 0; c < I; c++) forward_small(C, P + c, I, I), backward_small(C, P + c, I, I);
+        for (int32_t c = 0; c < I; c++) solve_small(C, P + c, I);
         real *of_D = factor_of(f, L + 5);
-        memcpy(of_D, D, sizeof(real) * (size_t)square);
+        copy(of_D, D, (size_t)square);
         if (!factorise_small(of_D, I)) return 0;
-        for (int32_t c = 0; c < I; c++) forward_small(of_D, Q + c, I, I), backward_small(of_D, Q + c, I, I);
+        for (int32_t c = 0; c < I; c++) solve_small(of_D, Q + c, I);
         for (int32_t i = 0; i < I; i++)
             for (int32_t c = 0; c < I; c++) {
                 real *restrict to = next + times(i * I + c, m + 2);
                 to[0] = 0;
-                memcpy(to + 1, B + times(i * I + c, m + 1), sizeof(real) * (size_t)(m + 1));
+                copy(to + 1, B + times(i * I + c, m + 1), (size_t)(m + 1));
                 for (int32_t k = 0; k < I; k++) {
                     add_scaled(to, -Q[k * I + c], F + times(i * I + k, L), m + 1);
                     E[i * I + c] -= Delta[i * I + k] * Q[k * I + c];
@@ -248,7 +293,8 @@ static int factorise(const toeplitz_system *t, real price)
             for (int32_t c = 0; c < I; c++) {
                 real *to = F + times(i * I + c, L);
                 to[m + 1] = 0;
-                for (int32_t k = 0; k < I; k++) add_scaled(to + 1, -P[k * I + c], B + times(i * I + k, m + 1), m + 1);
+                for (int32_t k = 0; k < I; k++)
+                    add_scaled(to + 1, -P[k * I + c], B + times(i * I + k, m + 1), m + 1);
             }
         B = next;
     }
@@ -259,24 +305,27 @@ static real solve_factorised(const budget *f, const real *u, real *v)
 {
     const int32_t I = f->s.I, L = f->s.L;
     real *z = factor_of(f, L), energy = 0;
-    if (v) memset(v, 0, sizeof(real) * times(I, L));
+    if (v) clear(v, times(I, L));
     for (int32_t m = 0; m < L; m++) {
         const real *B = predictor_of(f, m), *C = factor_of(f, m);
         for (int32_t c = 0; c < I; c++) {
             z[c] = 0;
-            for (int32_t i = 0; i < I; i++) z[c] += dot(B + times(i * I + c, m + 1), u + times(i, L), m + 1);
+            for (int32_t i = 0; i < I; i++)
+                z[c] += dot(B + times(i * I + c, m + 1), u + times(i, L), m + 1);
         }
         forward_small(C, z, I, 1);
         for (int32_t c = 0; c < I; c++) energy += z[c] * z[c];
         if (!v) continue;
         backward_small(C, z, I, 1);
         for (int32_t i = 0; i < I; i++)
-            for (int32_t c = 0; c < I; c++) add_scaled(v + times(i, L), z[c], B + times(i * I + c, m + 1), m + 1);
+            for (int32_t c = 0; c < I; c++)
+                add_scaled(v + times(i, L), z[c], B + times(i * I + c, m + 1), m + 1);
     }
     return energy;
 }
 
-/* Set v to the filter at a price, u to R v, and return its power; 0 and no filter if there is no solution. */
+/* Set v to the filter at a price, u to R v, and return its power; 0 and no filter if there is no
+ * solution. */
 static real power_at(const toeplitz_system *t, real price, real *v, real *u, int *solved)
 {
     const budget *f = t->f;
@@ -287,18 +336,19 @@ static real power_at(const toeplitz_system *t, real price, real *v, real *u, int
         for (int32_t i = 0; i < n; i++) *solved = *solved && within(v[i], LARGEST_TAP);
     }
     if (!*solved) {
-        memset(v, 0, sizeof(real) * (size_t)n);
+        clear(v, (size_t)n);
         return 0;
     }
     multiply_toeplitz(f, u, t->R, t->row_R, t->next_R, v);
     return dot(v, u, n);
 }
 
-/* Return the least price >= 0 at which the filter takes at most `power`; set v to it. power^-1/2 is a concave function of the
- * price, nearly a line, so Newton's steps approach from below. */
+/* Return the least price >= 0 at which the filter takes at most `power`; set v to it. power^-1/2 is
+ * a concave function of the price, nearly a line, so Newton's steps approach from below. */
 static real price_of(const toeplitz_system *t, real power, real start, real *v)
 {
-    real price = start < (real)1e6 * t->scale ? start : 0, *u = taps_of(t->f, PLAYED);
+    real price = start < (real)1e6 * t->scale ? start : 0;
+    real *u = taps_of(t->f, PLAYED);
     int solved = 0;
     for (int n = 0; n < NEWTON; n++) {
         const real taken = power_at(t, price, v, u, &solved);
@@ -319,22 +369,38 @@ static real price_of(const toeplitz_system *t, real power, real start, real *v)
 
 /* The references. */
 
-/* Add the block to the windows of the references; x is zero before the first, so they are positive definite. */
+/* The windowed sums of x_i(t) x_a(t - l), of one of the scales. */
+static real *window_of_references(const budget *f, int32_t scale, int32_t i, int32_t a)
+{
+    const int32_t I = f->s.I;
+    if (scale == 0) return f->R + times(i * I + a, f->lags);
+    return f->short_R + times(((scale - 1) * I + i) * I + a, f->s.L);
+}
+
+/* Add the block to the windows of the references; x is zero before the first, so they are positive
+ * definite. */
 static void take_references(budget *f)
 {
     const int32_t I = f->s.I, L = f->s.L, B = f->posterior.B;
     real g[SCALES + 1], fade[SCALES + 1];
-    for (int c = 0; c <= SCALES; c++) g[c] = raised(*f->s.setting[WINDOW], SCALE[c]), fade[c] = raised(g[c], B);
+    for (int c = 0; c <= SCALES; c++) {
+        g[c] = raised(*f->s.setting[WINDOW], SCALE[c]);
+        fade[c] = raised(g[c], B);
+    }
     for (int32_t i = 0; i < I; i++) {
         const real *u = history_of(&f->posterior, i);
         real share[SCALES + 1] = {1, 1, 1, 1}, sum[SCALES + 1] = {0};
         for (int32_t t = 0; t < B; t++)
-            for (int c = 0; c <= SCALES; c++) work_row(f, c)[t] = share[c] * u[t], sum[c] += share[c], share[c] *= g[c];
+            for (int c = 0; c <= SCALES; c++) {
+                work_row(f, c)[t] = share[c] * u[t];
+                sum[c] += share[c];
+                share[c] *= g[c];
+            }
         for (int c = 0; c <= SCALES; c++) {
             const int32_t lags = c ? L : f->lags;
             real *sums = work_row(f, WORKS - 1);
             for (int32_t a = 0; a < I; a++) {
-                real *restrict R = c ? f->short_R + times(((c - 1) * I + i) * I + a, L) : f->R + times(i * I + a, lags);
+                real *restrict R = window_of_references(f, c, i, a);
                 correlate(sums, work_row(f, c), B, history_of(&f->posterior, a), lags);
                 for (int32_t l = 0; l < lags; l++) R[l] = faded(R[l], fade[c], sums[l]);
             }
@@ -352,7 +418,11 @@ static void correlate_references(budget *f)
         for (int32_t a = 0; a < I; a++) {
             const real *R = f->R + times(i * I + a, lags), *other = f->R + times(a * I + i, lags);
             real *C = f->C + times(i * I + a, 2 * lags - 1) + (lags - 1), taper = 1;
-            for (int32_t l = 0; l < lags; l++, taper *= g) C[l] = R[l] / weight * taper, C[-l] = other[l] / weight * taper;
+            for (int32_t l = 0; l < lags; l++) {
+                C[l] = R[l] / weight * taper;
+                C[-l] = other[l] / weight * taper;
+                taper *= g;
+            }
         }
 }
 
@@ -362,46 +432,72 @@ static void correlate_references(budget *f)
 static int32_t lasting(int32_t T, int32_t scale, int32_t least)
 {
     const int32_t whole_blocks = TWICE * T / scale, rest = TWICE * T % scale;
-    const int32_t rounded = whole_blocks + (2 * rest > scale || (2 * rest == scale && whole_blocks % 2));
+    const int up = 2 * rest > scale || (2 * rest == scale && whole_blocks % 2);
+    const int32_t rounded = whole_blocks + up;
     return rounded > least ? rounded : least;
 }
 
-/* Return the largest share of its power that the account of loudspeaker j stands, for the filter v and its power: it must
- * stand it if the last t goes on for twice as long, for every t. */
-static real share_of(const budget *f, int32_t j, const real *v, real taken)
+/* Return the mean power of the filter v in the present block. */
+static real power_of_block(const budget *f, const real *v)
 {
-    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, T = f->T, B = f->posterior.B, least = T / SHORTEST;
-    real power[SCALES + 2] = {taken}, spent = 0, share = 0; /* of all scales, and last that of the block */
-    int32_t blocks[SCALES + 2];
-    real *y = work_row(f, 0), *part = work_row(f, 1), *wide = work_row(f, 2);
-    memset(y, 0, sizeof(real) * (size_t)B);
-    for (int32_t i = 0; i < I; i++) correlate(part, v + times(i, L), L, history_of(&f->posterior, i), B), add_to(y, part, B);
-    power[SCALES + 1] = dot(y, y, B) / (real)B, blocks[SCALES + 1] = least;
-    for (int c = 0; c <= SCALES; c++) blocks[c] = lasting(T, SCALE[c], least);
+    const int32_t L = f->s.L, B = f->posterior.B;
+    real *y = work_row(f, 0), *part = work_row(f, 1);
+    clear(y, (size_t)B);
+    for (int32_t i = 0; i < f->s.I; i++) {
+        correlate(part, v + times(i, L), L, history_of(&f->posterior, i), B);
+        add_to(y, part, B);
+    }
+    return dot(y, y, B) / (real)B;
+}
+
+/* Add the powers of the filter v for the references of the short windows to power[1] to
+ * power[SCALES]: E[y^2] = sum_l (v_i ~ v_a)(l) C_ia(l), with both signs of l in the two orders of i
+ * and a. */
+static void add_powers(const budget *f, const real *v, real *power)
+{
+    const int32_t I = f->s.I, L = f->s.L;
+    real *part = work_row(f, 1), *wide = work_row(f, 2);
     for (int32_t a = 0; a < I; a++) {
-        memcpy(wide, v + times(a, L), sizeof(real) * (size_t)L);
-        memset(wide + L, 0, sizeof(real) * (size_t)L);
+        copy(wide, v + times(a, L), (size_t)L);
+        clear(wide + L, (size_t)L);
         for (int32_t i = 0; i < I; i++) {
             correlate(part, v + times(i, L), L, wide, L); /* sum_m v_a(m + l) v_i(m) */
-            for (int c = 1; c <= SCALES; c++) {
-                /* E[y^2] = sum_l (v_i ~ v_a)(l) C_ia(l), with both signs of l in the two orders of i and a */
-                const real *R = f->short_R + times(((c - 1) * I + i) * I + a, L), g = raised(root(*f->s.setting[WINDOW]), SCALE[c]);
+            for (int32_t c = 1; c <= SCALES; c++) {
+                const real *R = window_of_references(f, c, i, a);
+                const real g = raised(root(*f->s.setting[WINDOW]), SCALE[c]);
                 real taper = g, sum = 0;
-                for (int32_t l = 1; l < L; l++, taper *= g) sum += taper * R[l] * part[l];
+                for (int32_t l = 1; l < L; l++) {
+                    sum += taper * R[l] * part[l];
+                    taper *= g;
+                }
                 power[c] += (part[0] * R[0] + 2 * sum) / f->weight[c];
             }
         }
     }
-    for (int32_t t = 0; t <= T; t++) {
-        for (int c = 0; c < SCALES + 2; c++) {
-            const int32_t n = blocks[c];
-            if (t != T - n) continue;
-            const real left = larger((real)T - spent, LEAST_SHARE * (real)n) / (real)n * f->s.setting[RATED_POWER][j] / larger(power[c], LEAST_POWER);
-            if (share == 0 || left < share) share = left;
-        }
-        if (t < T) spent += f->book[times(t, J) + (size_t)j];
+}
+
+/* Return the largest factor on the power of filter v that loudspeaker j's account can afford. What
+ * lasted t is expected to go on for twice as long, for every t: for n blocks, with the mean power
+ * over t. `taken` is that of the first scale. */
+static real affordable(const budget *f, int32_t j, const real *v, real taken)
+{
+    const int32_t T = f->T, least = T / SHORTEST;
+    const real rated = f->s.setting[RATED_POWER][j];
+    real power[SCALES + 2] = {taken}, factor = 0;
+    int32_t blocks[SCALES + 2];
+    for (int c = 0; c <= SCALES; c++) blocks[c] = lasting(T, SCALE[c], least);
+    add_powers(f, v, power);
+    blocks[SCALES + 1] = least;
+    power[SCALES + 1] = power_of_block(f, v);
+    for (int c = 0; c < SCALES + 2; c++) {
+        const real n = (real)blocks[c];
+        const real spent =
+            spent_by(f, j, T - blocks[c]); /* and in the account after n blocks, too */
+        const real left = larger((real)T - spent, LEAST_SHARE * n);
+        const real afforded = left / n * rated / larger(power[c], LEAST_POWER);
+        if (c == 0 || afforded < factor) factor = afforded;
     }
-    return share;
+    return factor;
 }
 
 /* Set the price of loudspeaker j, and its filter at that price, given what the others leave. */
@@ -410,52 +506,85 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const size_t row = (size_t)(2 * L - 1), row_C = (size_t)(2 * f->lags - 1);
     const real rated = f->s.setting[RATED_POWER][j];
+    const real slow = root(raised(*f->s.setting[WINDOW], f->posterior.B));
     real *v = taps_of(f, SOLUTION), account = 1 - ACCOUNT * larger(left, 0), q = 0;
-    toeplitz_system t = {f, f->A + times(j * I * J + j, I) * row, f->C + (f->lags - L), row, times(J, I) * row, row_C, times(I, 1) * row_C, rest, 0};
+    toeplitz_system t = {
+        .f = f,
+        .A = f->A + times(j * I * J + j, I) * row,
+        .row_A = times(J, I) * row,
+        .next_A = row,
+        .R = f->C + (f->lags - L),
+        .row_R = times(I, 1) * row_C,
+        .next_R = row_C,
+        .b = rest,
+    };
     int solved;
-    for (int32_t i = 0; i < I && !(t.scale > 0); i++) /* of the first reference that is not silent */
-        t.scale = t.A[(t.row_A + t.next_A) * (size_t)i + (size_t)(L - 1)] / larger(t.R[(t.row_R + t.next_R) * (size_t)i + (size_t)(L - 1)], LEAST_POWER);
-    /* 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly only. */
+    for (int32_t i = 0; i < I && !(t.scale > 0); i++) { /* of the first reference that is heard */
+        const real *A = t.A + (t.row_A + t.next_A) * (size_t)i;
+        const real *R = t.R + (t.row_R + t.next_R) * (size_t)i;
+        t.scale = A[L - 1] / larger(R[L - 1], LEAST_POWER);
+    }
+    /* 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly. */
     f->steady[j] = price_of(&t, rated, f->steady[j], v);
-    f->steady[J + j] = larger(f->steady[j], f->steady[J + j] * root(raised(*f->s.setting[WINDOW], f->posterior.B)));
+    f->steady[J + j] = larger(f->steady[j], f->steady[J + j] * slow);
     /* 3 What the account holds makes power cheaper, but none that saves little of the noise. */
     for (int n = 0; n < 4; n++) account *= account;
     for (int32_t k = 0; k < f->s.K; k++) q += f->posterior.q[k];
     real price = larger(f->steady[J + j] * account, WORTHWHILE * q / (rated * (real)J));
     const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
-    /* 4 The account must stand it. */
-    const real share = power > 0 ? share_of(f, j, v, power) : 1;
-    if (share < 1) price = price_of(&t, share * power, price, v);
+    /* 4 The account must afford it. */
+    const real factor = power > 0 ? affordable(f, j, v, power) : 1;
+    if (factor < 1) price = price_of(&t, factor * power, price, v);
     f->price[j] = price;
-    memcpy(weights_of(&f->s, j), v, sizeof(real) * times(I, L));
+    copy(weights_of(&f->s, j), v, times(I, L));
 }
 
-/* The correlations of the filtered references, and with the disturbance. */
-static void correlate_filtered(budget *f)
+/* Set the correlations of x'_ji with x'_ac, and those of x'_ac with x'_ji:
+ * E[x'_ji(t) x'_ac(t - l)] = sum_u (s_j ~ s_a)(u) C_ic(l - u), where
+ * (s_a ~ s_j)(u) = (s_j ~ s_a)(-u). */
+static void correlate_pair(budget *f, int32_t j, int32_t i, int32_t a, int32_t c)
 {
     const posterior *p = &f->posterior;
-    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, M = f->s.M, N = p->N, middle = f->lags - 1, lags = 2 * L - 1, both = 2 * f->lags - 1;
-    real *part = work_row(f, 0);
+    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, M = f->s.M, lags = 2 * L - 1;
+    const int32_t from = a == j && c == i ? L - 1 : 0; /* of one signal they are symmetric */
+    const real *ss = p->ss + times(a * J + j, 2 * M - 1);
+    const real *C = f->C + times(i * I + c, 2 * f->lags - 1) + (f->lags - L - M + 1 + from);
+    real *A = f->A + times((j * I + i) * J * I + a * I + c, lags);
+    real *other = f->A + times((a * I + c) * J * I + j * I + i, lags);
+    correlate(A + from, ss, 2 * M - 1, C, lags - from);
+    for (int32_t l = from ? L : 0; l < lags; l++) other[lags - 1 - l] = A[l];
+}
+
+/* Set the correlations of d with x'_ji:
+ * E[d(t) x'_ji(t - l)] = sum_u (p_c ~ s_j)(u) C_ci(l - u), summed over c. */
+static void correlate_disturbance(budget *f, int32_t j, int32_t i)
+{
+    const posterior *p = &f->posterior;
+    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, M = f->s.M, N = p->N;
+    real *b = f->b + times(j * I + i, L), *part = work_row(f, 0);
+    clear(b, (size_t)L);
+    for (int32_t c = 0; c < I; c++) {
+        const real *ps = p->ps + times(c * J + j, N + M - 1);
+        const real *C = f->C + times(c * I + i, 2 * f->lags - 1) + (f->lags - N);
+        correlate(part, ps, N + M - 1, C, L);
+        add_to(b, part, L);
+    }
+}
+
+/* Set the correlations of all filtered references, and with the disturbance. */
+static void correlate_filtered(budget *f)
+{
+    const int32_t I = f->s.I, J = f->s.J;
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++) {
             for (int32_t a = 0; a <= j; a++)
-                for (int32_t c = 0; c < (a < j ? I : i + 1); c++) {
-                    /* E[x'_ji(t) x'_ac(t - l)] = sum_u (s_j ~ s_a)(u) C_ic(l - u); (s_a ~ s_j)(u) = (s_j ~ s_a)(-u) */
-                    real *A = f->A + times((j * I + i) * J * I + a * I + c, lags), *other = f->A + times((a * I + c) * J * I + j * I + i, lags);
-                    const int32_t from = other == A ? L - 1 : 0; /* the lags of one signal with itself are symmetric */
-                    correlate(A + from, p->ss + times(a * J + j, 2 * M - 1), 2 * M - 1, f->C + times(i * I + c, both) + (middle - L - M + 2 + from), lags - from);
-                    for (int32_t l = from ? L : 0; l < lags; l++) other[lags - 1 - l] = A[l];
-                }
-            real *b = f->b + times(j * I + i, L);
-            memset(b, 0, sizeof(real) * (size_t)L);
-            for (int32_t c = 0; c < I; c++) { /* E[d(t) x'_ji(t - l)] = sum_u (p_c ~ s_j)(u) C_ci(l - u) */
-                correlate(part, p->ps + times(c * J + j, N + M - 1), N + M - 1, f->C + times(c * I + i, both) + (middle - N + 1), L);
-                add_to(b, part, L);
-            }
+                for (int32_t c = 0; c < (a < j ? I : i + 1); c++) correlate_pair(f, j, i, a, c);
+            correlate_disturbance(f, j, i);
         }
 }
 
-/* Give each loudspeaker in turn the filter of least expected error at its price, given the others'. */
+/* Give each loudspeaker in turn the filter of least expected error at its price, given the others'.
+ */
 static void solve_all(budget *f)
 {
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L, n = I * L;
@@ -465,11 +594,12 @@ static void solve_all(budget *f)
     correlate_references(f);
     correlate_filtered(f);
     for (int32_t j = 0; j < J; j++) {
-        const real left = 1 - spent_by(f, j) / (real)f->T;
-        memcpy(rest, f->b + times(j, n), sizeof(real) * (size_t)n);
+        const real left = 1 - spent_by(f, j, f->T) / (real)f->T;
+        copy(rest, f->b + times(j, n), (size_t)n);
         for (int32_t a = 0; a < J; a++) {
             if (a == j) continue;
-            multiply_toeplitz(f, part, f->A + times(j * I * J + a, I) * row, row_A, row, weights_of(&f->s, a));
+            const real *A = f->A + times(j * I * J + a, I) * row;
+            multiply_toeplitz(f, part, A, row_A, row, weights_of(&f->s, a));
             add_scaled(rest, -1, part, n);
         }
         spend(f, j, rest, left);
@@ -484,35 +614,47 @@ static void end_block(budget *f)
     take_references(f);
     if (*f->controlled) {
         memmove(f->book + J, f->book, sizeof(real) * times(f->T - 1, J));
-        for (int32_t j = 0; j < J; j++) f->book[j] = f->asked[J + j] / (real)B / f->s.setting[RATED_POWER][j];
+        for (int32_t j = 0; j < J; j++)
+            f->book[j] = f->asked[J + j] / (real)B / f->s.setting[RATED_POWER][j];
     }
     learn(&f->posterior, root(raised(*f->s.setting[WINDOW], B)));
     if (*f->posterior.fits) solve_all(f);
     *f->controlled = 0;
-    memset(f->asked + J, 0, sizeof(real) * (size_t)J);
+    clear(f->asked + J, (size_t)J);
     set_room(f);
     begin_block(&f->posterior);
+}
+
+/* Return why a sample cannot be learned from, or ANC_DONE. */
+static int fault_of(const budget *f, const real *error)
+{
+    const signals *s = &f->s;
+    for (int32_t i = 0; i < s->I; i++)
+        if (!within(*newest(&s->x, i), anc_loudest_learnt)) return ANC_LOUD_REFERENCE;
+    for (int32_t j = 0; j < s->J; j++) {
+        if (!within(*newest(&s->y, j), anc_loudest)) return ANC_LOUD_REFERENCE;
+        if (!within(f->asked[j], anc_loudest)) return ANC_LOUD_REFERENCE;
+    }
+    for (int32_t k = 0; error && k < s->K; k++)
+        if (!within(error[k], anc_loudest_learnt)) return ANC_LOUD_ERROR;
+    return ANC_DONE;
 }
 
 /* Note a sample; at the end of a block, learn. */
 static int note(budget *f, const real *error, int controlled)
 {
     const signals *s = &f->s;
-    for (int32_t i = 0; i < s->I; i++)
-        if (!within(*newest(&s->x, i), anc_loudest_learnt)) return ANC_LOUD_REFERENCE;
-    for (int32_t j = 0; j < s->J; j++)
-        if (!within(*newest(&s->y, j), anc_loudest) || !within(f->asked[j], anc_loudest)) return ANC_LOUD_REFERENCE;
-    for (int32_t k = 0; error && k < s->K; k++)
-        if (!within(error[k], anc_loudest_learnt)) return ANC_LOUD_ERROR;
-    const int refused = error ? anc_take_error((anc_view *)f, error) : ANC_DONE;
+    posterior *p = &f->posterior;
+    int refused = fault_of(f, error);
+    if (!refused && error) refused = anc_take_error((anc_view *)f, error);
     if (refused) return refused;
-    for (int32_t i = 0; i < s->I; i++) *place_of(&f->posterior, i) = *newest(&s->x, i);
+    for (int32_t i = 0; i < s->I; i++) *place_of(p, i) = *newest(&s->x, i);
     for (int32_t j = 0; j < s->J; j++) {
-        *place_of(&f->posterior, s->I + j) = *newest(&s->y, j);
+        *place_of(p, s->I + j) = *newest(&s->y, j);
         if (controlled) f->asked[s->J + j] += f->asked[j] * f->asked[j];
     }
     *f->controlled |= controlled;
-    if (complete_sample(&f->posterior, error)) end_block(f);
+    if (complete_sample(p, error)) end_block(f);
     return ANC_DONE;
 }
 
@@ -523,17 +665,32 @@ static int control_signal_budget(anc_view *view, const real *reference, real *co
     if (is_too_loud(s, reference)) return ANC_LOUD_REFERENCE;
     if (f->posterior.heard[AWAITED]) note(f, NULL, 1); /* that error never came */
     const int refused = take_reference(s, reference);
-    for (int32_t j = 0; !refused && j < s->J; j++) {
-        const real y = filter_output(s, j), left = larger(f->asked[2 * s->J + j] - f->asked[s->J + j], 0);
-        f->asked[j] = y * y <= left ? y : y < 0 ? -root(left) : root(left);
+    f->posterior.heard[AWAITED] = !refused;
+    if (refused) return refused;
+    for (int32_t j = 0; j < s->J; j++) {
+        const real left = larger(f->asked[2 * s->J + j] - f->asked[s->J + j], 0), most = root(left);
+        const real y = filter_output(s, j);
+        f->asked[j] = y * y <= left ? y : y < 0 ? -most : most;
         emit(s, j, f->asked[j]);
         control[j] = s->control[j];
     }
-    f->posterior.heard[AWAITED] = !refused;
-    return refused;
+    return ANC_DONE;
 }
 
-static int update_budget(anc_view *view, const real *error) { return note((budget *)view, error, 1); }
-static int listen_budget(anc_view *view, const real *error) { return note((budget *)view, error, 0); }
+static int update_budget(anc_view *view, const real *error)
+{
+    return note((budget *)view, error, 1);
+}
+static int listen_budget(anc_view *view, const real *error)
+{
+    return note((budget *)view, error, 0);
+}
 
-const anc_algorithm anc_power_budget = {"KF-PB", budget_settings, layout_budget, start_budget, control_signal_budget, update_budget, listen_budget};
+const anc_algorithm anc_power_budget = {.name = "KF-PB",
+                                        .settings = budget_settings,
+                                        .layout = layout_budget,
+                                        .start = start_budget,
+                                        .unfiltered = 1,
+                                        .control_signal = control_signal_budget,
+                                        .update = update_budget,
+                                        .listen = listen_budget};

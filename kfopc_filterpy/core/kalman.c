@@ -1,46 +1,48 @@
-/* KF-ANC and KF-OPC: eq. 2-9 of Ji et al. with the factor of eq. 10-13, and FxRLS, which is the same with a fading
- * memory. */
+/* KF-ANC and KF-OPC: eq. 2-9 of Ji et al. with the factor of eq. 10-13, and FxRLS, which is the
+ * same with a fading memory. */
 #include "covariance.h"
-#include <string.h>
 
 typedef struct {
     signals s;
     covariance c;
-    real *scaled;                /* (S, K) alpha d^, the measurements */
-    real *innovation, *variance; /* (S, K) and (K), S of eq. 7, of the last sample */
+    real *scaled;     /* (S, K) alpha d^, the measurements */
+    real *innovation; /* (S, K) of the last sample */
+    real *variance;   /* (K) S of eq. 7, of the last sample */
 } kalman;
 
 enum { STATE_NOISE, MEASUREMENT_NOISE, INITIAL_VARIANCE, FADING };
-static const anc_setting kalman_settings[] = {
-    {"state_noise", 0, 0, ANC_ONE}, {"measurement_noise", 0, 0, ANC_EACH_MICROPHONE}, {"initial_variance", 0, 0, ANC_ONE},
-    {"fading", 1, 1e30f, ANC_ONE}, {0}};
+static const anc_setting kalman_settings[] = {{"state_noise", 0, 0, ANC_ONE},
+                                              {"measurement_noise", 0, 0, ANC_EACH_MICROPHONE},
+                                              {"initial_variance", 0, 0, ANC_ONE},
+                                              {"fading", 1, 1e30f, ANC_ONE},
+                                              {0}};
 
-static void layout_kalman(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
+static void layout_kalman(anc_view *view, const anc_plan *plan, anc_layout *at)
 {
     kalman *f = (kalman *)view;
-    layout_signals(&f->s, plan, settings, at);
+    (void)plan;
     layout_covariance(&f->c, states(&f->s), at);
     f->scaled = reals(at, "measurement", ANC_SCRATCH, 1, 1, f->s.S, f->s.K);
     f->innovation = reals(at, "innovation", ANC_STATE, 1, 1, f->s.S, f->s.K);
     f->variance = reals(at, "innovation_variance", ANC_STATE, 1, 1, 1, f->s.K);
 }
 
-static void start_kalman(anc_view *view, const anc_plan *plan, const anc_setting *settings)
+static void start_kalman(anc_view *view)
 {
     kalman *f = (kalman *)view;
-    start_signals(&f->s, plan, settings);
     start_covariance(&f->c, *f->s.setting[INITIAL_VARIANCE]);
 }
 
-/* Set h to the filtered references of microphone k, those of all control filters one after the other. */
+/* Set h to the filtered references of microphone k, those of all control filters one after the
+ * other. */
 static void observe(kalman *f, const lines *rows, int32_t k)
 {
-    const int32_t n = f->s.J * f->s.I;
-    for (int32_t ji = 0; ji < n; ji++) memcpy(f->c.h + times(ji, f->s.L), newest(rows, k * n + ji), sizeof(real) * (size_t)f->s.L);
+    const int32_t n = f->s.J * f->s.I, L = f->s.L;
+    for (int32_t ji = 0; ji < n; ji++)
+        copy(f->c.h + times(ji, L), newest(rows, k * n + ji), (size_t)L);
 }
 
-/* Measure z at microphone k: eq. 5-9 for every scenario, with one gain. The microphones' noises are independent, so they
- * are measured one after the other. */
+/* Measure z at microphone k, or zero if z is NULL: eq. 5-9 for every scenario, with one gain. */
 static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
 {
     const int32_t K = f->s.K;
@@ -49,39 +51,50 @@ static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
     const real S = project(&f->c, q) + q; /* eq. 7 */
     const int tell = tells(&f->c, S);
     const real inverse_root = tell ? downdate(&f->c, S) : 0;
+    if (z) f->variance[k] = S;
     for (int32_t scenario = 0; scenario < f->s.S; scenario++) {
         real *w = weights_of(&f->s, scenario * f->s.J);
-        const real y = (z ? z[scenario * K + k] : 0) - dot(f->c.h, w, f->c.n);
-        if (z) f->innovation[scenario * K + k] = y, f->variance[k] = S;
-        if (tell) correct(&f->c, w, y, inverse_root, anc_longest_step);
+        const real measured = z ? z[scenario * K + k] : 0;
+        const real y = measured - dot(f->c.h, w, f->c.n);
+        if (z) f->innovation[scenario * K + k] = y;
+        if (tell) correct(&f->c, w, y, inverse_root);
     }
 }
 
-/* Eq. 2-9 with the measurements in `scaled`, after `estimate`; commits. */
-static int correct_weights(kalman *f)
+/* Return whether P can be predicted, and all rows be measured, without overflow. */
+static int solvable(const kalman *f, real fading, real r)
 {
-    signals *s = &f->s;
-    const real fading = *s->setting[FADING], state_noise = *s->setting[STATE_NOISE];
+    const signals *s = &f->s;
     const int32_t n = s->J * s->I;
-    for (int32_t k = 0; k < s->K; k++)
-        if (!predictable(&f->c, fading, state_noise, energy_of(s, &s->filtered, k * n, n)) ||
-            (s->G && !predictable(&f->c, fading, state_noise, energy_of(s, &s->guarded, k * n, n))))
-            return ANC_NO_SOLUTION;
-    predict(&f->c, fading, state_noise); /* eq. 4, once a sample */
-    for (int32_t k = 0; k < s->K; k++) measure(f, &s->filtered, k, f->scaled);
-    for (int32_t k = 0; s->G && k < s->K; k++) measure(f, &s->guarded, k, NULL); /* as if w'x'' had been measured as zero */
-    commit(s);
-    return ANC_DONE;
+    for (int32_t k = 0; k < s->K; k++) {
+        if (!predictable(&f->c, fading, r, energy_of(s, &s->filtered, k * n, n))) return 0;
+        if (s->G && !predictable(&f->c, fading, r, energy_of(s, &s->guarded, k * n, n))) return 0;
+    }
+    return 1;
 }
 
 static int update_kalman(anc_view *view, const real *error)
 {
     kalman *f = (kalman *)view;
-    if (!error) return ANC_DONE;
-    const int refused = estimate(&f->s, error);
-    if (refused) return refused;
-    for (int32_t sk = 0; sk < f->s.S * f->s.K; sk++) f->scaled[sk] = least_factor(&f->s, sk / f->s.K) * f->s.estimate[sk]; /* eq. 9 */
-    return correct_weights(f);
+    signals *s = &f->s;
+    const real fading = *s->setting[FADING], r = *s->setting[STATE_NOISE];
+    const int refused = error ? estimate(s, error) : ANC_DONE;
+    if (!error || refused) return refused;
+    if (!solvable(f, fading, r)) return ANC_NO_SOLUTION;
+    for (int32_t sk = 0; sk < s->S * s->K; sk++)
+        f->scaled[sk] = least_factor(s, sk / s->K) * s->estimate[sk]; /* eq. 9 */
+    predict(&f->c, fading, r);                                        /* eq. 4, once a sample */
+    /* The microphones' noises are independent, so they are measured one after the other. */
+    for (int32_t k = 0; k < s->K; k++) measure(f, &s->filtered, k, f->scaled);
+    for (int32_t k = 0; s->G && k < s->K; k++)
+        measure(f, &s->guarded, k, NULL); /* as if w'x'' had been measured as zero */
+    commit(s);
+    return ANC_DONE;
 }
 
-const anc_algorithm anc_kalman = {"Kalman filter", kalman_settings, layout_kalman, start_kalman, filtered_signal, update_kalman, NULL};
+const anc_algorithm anc_kalman = {.name = "Kalman filter",
+                                  .settings = kalman_settings,
+                                  .layout = layout_kalman,
+                                  .start = start_kalman,
+                                  .control_signal = filtered_signal,
+                                  .update = update_kalman};

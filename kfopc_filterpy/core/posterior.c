@@ -1,18 +1,28 @@
 #include "posterior.h"
-#include <string.h>
 
-static const real UNKNOWN = 4;                          /* after an alarm: rms error of a secondary path, over the path */
-static const real KEPT = 4, FORGOTTEN = (real)0.0625;   /* samples per tap that the data of p count as: after an alarm; if p has changed too */
-enum { FROM = 9, TO = 16, MANY = 4 };                   /* blocks after an alarm that are judged, and how many must exceed its limit to show that p has changed */
-static const real SURPRISE = 4, MISFIT = (real)0.03, USUAL = 5; /* alarm: beyond the noise; of d^2; of the usual misfit */
-enum { QUIET = 31 };                                    /* blocks, at least, from the first fit after an alarm to the next alarm */
-static const real KNOWN = (real)0.05;                    /* no alarm until this share of the memory has been heard */
-static const double WORK = 67108864;                    /* operations of a factorisation in a block, 2^26 */
+/* After an alarm: rms error of a secondary path, over the path. */
+static const real UNKNOWN = 4;
+/* Samples per tap that the data of p count as after an alarm, and if p has changed, too. */
+static const real KEPT = 4, FORGOTTEN = (real)0.0625;
+/* Blocks after an alarm that are judged, and how many of them must exceed its limit to show that p
+ * has changed. */
+enum { FROM = 9, TO = 16, MANY = 4 };
+/* An alarm is beyond SURPRISE times the noise, plus MISFIT of d^2 or USUAL times the usual misfit.
+ */
+static const real SURPRISE = 4, MISFIT = (real)0.03, USUAL = 5;
+/* Blocks, at least, from the first fit after an alarm to the next alarm. */
+enum { QUIET = 31 };
+/* No alarm until this share of the memory has been heard. */
+static const real KNOWN = (real)0.05;
+/* Operations of a factorisation in a block, 2^26. */
+static const double WORK = 67108864;
 
-/* Correlations. Every sum is in the order of k, whatever the number of sums that are formed at once. */
+/* Correlations. Every sum is in the order of k, whatever the number of sums that are formed at
+ * once. */
 
 /* Set the next `vectors_at_once` WIDE sums. */
-static inline void sums_of(real *restrict to, const real *restrict a, int32_t n, const real *restrict b, const int vectors_at_once)
+static inline void sums_of(real *restrict to, const real *restrict a, int32_t n,
+                           const real *restrict b, const int vectors_at_once)
 {
     vector sum[8];
     for (int v = 0; v < vectors_at_once; v++) sum[v] = zero;
@@ -21,7 +31,8 @@ static inline void sums_of(real *restrict to, const real *restrict a, int32_t n,
     for (int v = 0; v < vectors_at_once; v++) vectors_of(to)[v] = sum[v];
 }
 
-void correlate(real *restrict to, const real *restrict a, int32_t n, const real *restrict b, int32_t count)
+void correlate(real *restrict to, const real *restrict a, int32_t n, const real *restrict b,
+               int32_t count)
 {
     int32_t l = 0;
     for (; l + 8 * WIDE <= count; l += 8 * WIDE) sums_of(to + l, a, n, b + l, 8);
@@ -43,24 +54,33 @@ void correlate(real *restrict to, const real *restrict a, int32_t n, const real 
 
 static int32_t whole(int32_t n) { return (n + PARTS - 1) / PARTS * PARTS; }
 
-/* G is the lower triangle, one row after the other, in groups of PARTS rows that all end with the group's last column. */
+/* G is the lower triangle, one row after the other, in groups of PARTS rows that all end with the
+ * group's last column. */
 static real *row_of_data(const posterior *f, int32_t i)
 {
     const int32_t group = i / PARTS;
-    return f->G + times(group, group + 1) * (PARTS * PARTS / 2) + times(i % PARTS, group + 1) * PARTS;
+    return f->G + times(group, group + 1) * (PARTS * PARTS / 2) +
+           times(i % PARTS, group + 1) * PARTS;
 }
 
 /* The factor has the same groups, each with its columns one after the other: a panel. */
-static real *panel_of(const posterior *f, int32_t group) { return f->factor + times(group, group + 1) * (PARTS * PARTS / 2); }
+static real *panel_of(const posterior *f, int32_t group)
+{
+    return f->factor + times(group, group + 1) * (PARTS * PARTS / 2);
+}
 
 void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, anc_layout *at)
 {
-    const int32_t K = s->K, J = s->J, I = s->I, M = s->M, N = s->L + M - 1, n = I * N + (exact ? 0 : J * M);
+    const int32_t K = s->K, J = s->J, I = s->I, M = s->M, N = s->L + M - 1;
+    const int32_t n = I * N + (exact ? 0 : J * M);
     const int32_t groups = whole(n) / PARTS;
-    f->K = K, f->J = J, f->I = I, f->N = N, f->M = M, f->B = block, f->n = n, f->padded = whole(n), f->exact = exact;
-    f->history = s->L + N + block, f->delay = (int32_t)((double)n * n * n / 3 / WORK), f->width = 3 * N + block;
+    *f = (posterior){.K = K, .J = J, .I = I, .N = N, .M = M, .B = block, .n = n, .exact = exact};
+    f->padded = whole(n);
+    f->history = s->L + N + block;
+    f->width = 3 * N + block;
+    f->delay = (int32_t)((double)n * n * n / 3 / WORK);
     f->path = s->path;
-    f->numbers = (posterior_numbers *)reals(at, "posterior", ANC_STATE, 1, 1, 1, COLUMNS(posterior_numbers));
+    f->numbers = structs(at, "posterior", ANC_STATE, 1, 1, 1, sizeof *f->numbers);
     f->counts = int32s(at, "posterior_counts", ANC_STATE, POSTERIOR_COUNTS);
     f->fits = int32s(at, "fits", ANC_STATE, 1);
     f->alarms = int32s(at, "alarms", ANC_STATE, 1);
@@ -87,7 +107,7 @@ static void return_to_prior(posterior *f)
 {
     const int32_t split = f->I * f->N, taps = f->n - split;
     for (int32_t k = 0; taps && k < f->K; k++)
-        memcpy(f->theta + times(k, f->n) + split, f->path + times(k, taps), sizeof(real) * (size_t)taps);
+        copy(f->theta + times(k, f->n) + split, f->path + times(k, taps), (size_t)taps);
 }
 
 void start_posterior(posterior *f, real spread)
@@ -102,7 +122,10 @@ static real size_of_path(const posterior *f)
 {
     const int32_t paths = f->K * f->J;
     real sum = 0;
-    for (int32_t kj = 0; kj < paths; kj++) sum += dot(f->path + times(kj, f->M), f->path + times(kj, f->M), f->M);
+    for (int32_t kj = 0; kj < paths; kj++) {
+        const real *path = f->path + times(kj, f->M);
+        sum += dot(path, path, f->M);
+    }
     return sum / (real)paths;
 }
 
@@ -120,40 +143,52 @@ static real *work_of(const posterior *f, int32_t row) { return f->work + times(r
 /* Return the precision of element i. */
 static real precision_of(const posterior *f, int32_t i, real size)
 {
-    return i < f->I * f->N ? f->numbers->prior : (real)f->M / (f->numbers->spread * f->numbers->spread * size);
+    const real spread = f->numbers->spread;
+    return i < f->I * f->N ? f->numbers->prior : (real)f->M / (spread * spread * size);
+}
+
+/* Set the precision of the primary paths from |p|^2 = E[d^2] / E[x^2], and the first noise. Return
+ * 0 if nothing can be told yet. */
+static int set_prior(posterior *f)
+{
+    posterior_numbers *known = f->numbers;
+    real x2 = 0, e2 = 0;
+    for (int32_t i = 0; i < f->I * f->N; i++) x2 += row_of_data(f, i)[i];
+    for (int32_t k = 0; k < f->K; k++) {
+        if (!(f->ee[k] > 0)) return 0;
+        e2 += f->ee[k];
+    }
+    if (!(x2 > 0)) return 0;
+    known->prior = x2 * (real)f->K / e2;
+    for (int32_t k = 0; k < f->K; k++) f->q[k] = (real)1e-3 * f->ee[k] / known->samples;
+    return 1;
 }
 
 /* Set aside the present data for a factorisation. */
 static void begin_fit(posterior *f)
 {
-    const int32_t split = f->I * f->N, n = f->n;
     posterior_numbers *known = f->numbers;
-    if (known->prior == 0) { /* |p|^2 is expected to be E[d^2] / E[x^2] */
-        real x2 = 0, e2 = 0;
-        for (int32_t i = 0; i < split; i++) x2 += row_of_data(f, i)[i];
-        for (int32_t k = 0; k < f->K; k++) {
-            if (!(f->ee[k] > 0)) return;
-            e2 += f->ee[k];
-        }
-        if (!(x2 > 0)) return;
-        known->prior = x2 * (real)f->K / e2;
-        for (int32_t k = 0; k < f->K; k++) f->q[k] = (real)1e-3 * f->ee[k] / known->samples;
-    }
+    if (known->prior == 0 && !set_prior(f)) return;
     for (int32_t group = 0; group < f->padded / PARTS; group++) {
         const real *rows = row_of_data(f, group * PARTS);
         real *panel = panel_of(f, group);
         const int32_t columns = PARTS * (group + 1);
         for (int32_t c = 0; c < columns; c++)
-            for (int32_t i = 0; i < PARTS; i++) panel[PARTS * c + i] = rows[times(i, columns) + (size_t)c];
+            for (int32_t i = 0; i < PARTS; i++)
+                panel[PARTS * c + i] = rows[times(i, columns) + (size_t)c];
     }
-    memcpy(f->set_r, f->r, sizeof(real) * times(f->K, n));
-    memcpy(f->set_ee, f->ee, sizeof(real) * (size_t)f->K);
+    copy(f->set_r, f->r, times(f->K, f->n));
+    copy(f->set_ee, f->ee, (size_t)f->K);
     known->set_aside = known->fitted = known->samples;
-    f->counts[PENDING] = f->delay + 1, f->counts[GROUPS] = 0, f->counts[IDLE] = 0;
+    f->counts[PENDING] = f->delay + 1;
+    f->counts[GROUPS] = 0;
+    f->counts[IDLE] = 0;
 }
 
-/* Set S_ji = sum_k P_kj Q_ki, k < n: a square of PARTS by PARTS sums, WIDE of its rows at a time. */
-static void multiply_panels(real S[PARTS * PARTS], const real *restrict P, const real *restrict Q, int32_t n)
+/* Set S_ji = sum_k P_kj Q_ki, k < n: a square of PARTS by PARTS sums, WIDE of its rows at a time.
+ */
+static void multiply_panels(real S[PARTS * PARTS], const real *restrict P, const real *restrict Q,
+                            int32_t n)
 {
     for (int row = 0; row < PARTS; row += WIDE) {
         vector sum[WIDE][VECTORS];
@@ -161,13 +196,15 @@ static void multiply_panels(real S[PARTS * PARTS], const real *restrict P, const
             for (int v = 0; v < VECTORS; v++) sum[j][v] = zero;
         for (int32_t k = 0; k < n; k++)
             for (int j = 0; j < WIDE; j++)
-                for (int v = 0; v < VECTORS; v++) sum[j][v] += P[PARTS * k + row + j] * vectors(Q + PARTS * k)[v];
+                for (int v = 0; v < VECTORS; v++)
+                    sum[j][v] += P[PARTS * k + row + j] * vectors(Q + PARTS * k)[v];
         for (int j = 0; j < WIDE; j++)
             for (int v = 0; v < VECTORS; v++) vectors_of(S + PARTS * (row + j))[v] = sum[j][v];
     }
 }
 
-/* Set element j of PARTS equations at once, X_j = (X_j - S_j - sum_(k < j) C_jk X_k) / C_jj without the division. */
+/* Set element j of PARTS equations at once, X_j = (X_j - S_j - sum_(k < j) C_jk X_k) / C_jj,
+ * without the division. */
 static void eliminate(real *restrict X, const real *restrict S, const real *restrict C, int j)
 {
     for (int i = 0; i < PARTS; i++) X[PARTS * j + i] -= S[PARTS * j + i];
@@ -223,7 +260,8 @@ static void solve_backward(const posterior *f, real *Z)
         real *restrict X = Z + PARTS * PARTS * group;
         for (int j = PARTS - 1; j >= 0; j--) {
             for (int k = j + 1; k < PARTS; k++)
-                for (int i = 0; i < PARTS; i++) X[PARTS * j + i] -= C[PARTS * j + k] * X[PARTS * k + i];
+                for (int i = 0; i < PARTS; i++)
+                    X[PARTS * j + i] -= C[PARTS * j + k] * X[PARTS * k + i];
             for (int i = 0; i < PARTS; i++) X[PARTS * j + i] *= f->inverse[PARTS * group + j];
         }
         vector x[PARTS][VECTORS];
@@ -246,34 +284,68 @@ static real sign_of(int32_t *random)
     return next >> 31 ? 1 : -1;
 }
 
-/* Solve for the means of up to PARTS microphones from `first` on, and set their noise. */
+/* The prior mean of element i of theta, of microphone k: 0 of p, s^ of s. */
+static real prior_mean(const posterior *f, int32_t k, int32_t i)
+{
+    const int32_t split = f->I * f->N;
+    return i < split ? 0 : f->path[times(k, f->n - split) + (size_t)(i - split)];
+}
+
+/* Set the noise of microphone k from sum e^2 - 2 theta'r + theta'G theta, where
+ * G theta = r + q P (mean - theta). */
+static void set_noise(posterior *f, int32_t k, real q, real size)
+{
+    const int32_t n = f->n, split = f->I * f->N;
+    const real *theta = f->theta + times(k, n), *r = f->set_r + times(k, n);
+    const real ee = f->set_ee[k], samples = f->numbers->set_aside;
+    real bend = 0;
+    for (int32_t i = 0; i < n; i++)
+        bend += precision_of(f, i, size) * theta[i] * (prior_mean(f, k, i) - theta[i]);
+    const real residual = ee - dot(theta, r, n) + q * bend;
+    /* The earlier estimate counts as n samples: a short record leaves little noise by chance. */
+    const real weight = larger(samples - (real)split / 2, 0) + (real)n;
+    const real noise = (residual + (real)n * f->q[k]) / weight;
+    f->q[k] = larger(noise, (real)1e-6 * ee / samples);
+}
+
+/* Solve for the means of up to PARTS microphones from `first` on, and set their noise. Return 0 if
+ * a mean is not finite. */
 static int solve_means(posterior *f, int32_t first, real q, real size)
 {
-    const int32_t n = f->n, split = f->I * f->N, most = f->K - first < PARTS ? f->K - first : PARTS;
+    const int32_t n = f->n, split = f->I * f->N;
+    const int32_t most = f->K - first < PARTS ? f->K - first : PARTS;
     real *Z = f->sides;
-    memset(Z, 0, sizeof(real) * times(f->padded, PARTS));
+    clear(Z, times(f->padded, PARTS));
     for (int32_t c = 0; c < most; c++)
         for (int32_t i = 0; i < n; i++) {
-            const real mean = i < split ? 0 : f->path[times(first + c, n - split) + (size_t)(i - split)];
-            Z[PARTS * i + c] = f->set_r[times(first + c, n) + (size_t)i] + (i < split ? 0 : q * precision_of(f, i, size) * mean);
+            const real mean = prior_mean(f, first + c, i);
+            const real pull = i < split ? 0 : q * precision_of(f, i, size) * mean;
+            Z[PARTS * i + c] = f->set_r[times(first + c, n) + (size_t)i] + pull;
         }
-    solve_forward(f, Z), solve_backward(f, Z);
+    solve_forward(f, Z);
+    solve_backward(f, Z);
     for (int32_t i = 0; i < n * PARTS; i++)
         if (!isfinite(Z[i])) return 0;
-    for (int32_t k = first; k < first + most; k++) {
-        real *theta = f->theta + times(k, n), bend = 0;
-        for (int32_t i = 0; i < n; i++) {
-            theta[i] = Z[PARTS * i + k - first];
-            const real mean = i < split ? 0 : f->path[times(k, n - split) + (size_t)(i - split)];
-            bend += precision_of(f, i, size) * theta[i] * (mean - theta[i]);
-        }
-        /* sum e^2 - 2 theta'r + theta'G theta, where G theta = r + q P (mean - theta) */
-        const real ee = f->set_ee[k], residual = ee - dot(theta, f->set_r + times(k, n), n) + q * bend, samples = f->numbers->set_aside;
-        /* The earlier estimate counts as n samples: a short record leaves little noise by chance. */
-        const real noise = (residual + (real)n * f->q[k]) / (larger(samples - (real)split / 2, 0) + (real)n);
-        f->q[k] = larger(noise, (real)1e-6 * ee / samples);
+    for (int32_t c = 0; c < most; c++) {
+        real *theta = f->theta + times(first + c, n);
+        for (int32_t i = 0; i < n; i++) theta[i] = Z[PARTS * i + c];
+        set_noise(f, first + c, q, size);
     }
     return 1;
+}
+
+/* Draw from the posterior: theta has the covariance q (C C')^-1 = q C'^-1 C^-1. */
+static void set_draws(posterior *f, real q)
+{
+    const real scale = root(q);
+    real *Z = f->sides;
+    clear(Z, times(f->padded, PARTS));
+    for (int32_t d = 0; d < DRAWS; d++)
+        for (int32_t i = 0; i < f->n; i++) Z[PARTS * i + d] = sign_of(f->counts + RANDOM);
+    solve_backward(f, Z);
+    for (int32_t d = 0; d < DRAWS; d++)
+        for (int32_t i = 0; i < f->n; i++)
+            f->draws[times(d, f->n) + (size_t)i] = scale * Z[PARTS * i + d];
 }
 
 /* The factor is complete: solve for the posterior. */
@@ -281,25 +353,19 @@ static void end_fit(posterior *f, real q, real size)
 {
     for (int32_t first = 0; first < f->K; first += PARTS)
         if (!solve_means(f, first, q, size)) return;
-    if (!f->exact) { /* draws: theta has the covariance q (C C')^-1 = q C'^-1 C^-1 */
-        const real scale = root(q);
-        memset(f->sides, 0, sizeof(real) * times(f->padded, PARTS));
-        for (int32_t d = 0; d < DRAWS; d++)
-            for (int32_t i = 0; i < f->n; i++) f->sides[PARTS * i + d] = sign_of(f->counts + RANDOM);
-        solve_backward(f, f->sides);
-        for (int32_t d = 0; d < DRAWS; d++)
-            for (int32_t i = 0; i < f->n; i++) f->draws[times(d, f->n) + (size_t)i] = scale * f->sides[PARTS * i + d];
-    }
+    if (!f->exact) set_draws(f, q);
     count_up(f->fits);
-    f->counts[DOUBTFUL] = 0, f->counts[STALE] = 1;
+    f->counts[DOUBTFUL] = 0;
+    f->counts[STALE] = 1;
 }
 
 /* Do this block's part of the factorisation; every block does about as much. */
 static void go_on_fitting(posterior *f)
 {
     const real q = mean_noise(f), size = size_of_path(f);
-    const double groups = f->padded / PARTS, blocks = f->delay + 1, done = blocks + 1 - f->counts[PENDING];
-    for (double g = f->counts[GROUPS]; g < groups && g * g * g * blocks < groups * groups * groups * done; g++) {
+    const double groups = f->padded / PARTS, blocks = f->delay + 1;
+    const double done = blocks + 1 - f->counts[PENDING], all = groups * groups * groups;
+    for (double g = f->counts[GROUPS]; g < groups && g * g * g * blocks < all * done; g++) {
         if (!factorise_group(f, f->counts[GROUPS], q, size)) {
             f->counts[PENDING] = 0;
             return;
@@ -315,24 +381,30 @@ int complete_sample(posterior *f, const real *error)
 {
     const int32_t at = f->B - 1 - f->heard[FILLED];
     for (int32_t k = 0; error && k < f->K; k++) f->errors[times(k, f->B) + (size_t)at] = error[k];
-    f->heard[MISSING] |= !error, f->heard[AWAITED] = 0;
+    f->heard[MISSING] |= !error;
+    f->heard[AWAITED] = 0;
     return ++f->heard[FILLED] == f->B;
 }
 
 void begin_block(posterior *f)
 {
     f->heard[FILLED] = f->heard[MISSING] = 0;
-    for (int32_t i = 0; i < f->I + f->J; i++) memmove(history_of(f, i) + f->B, history_of(f, i), sizeof(real) * (size_t)(f->history - f->B));
+    for (int32_t i = 0; i < f->I + f->J; i++) {
+        real *z = history_of(f, i);
+        memmove(z + f->B, z, sizeof(real) * (size_t)(f->history - f->B));
+    }
 }
 
 /* Set d to p * x and z to s * y of the block. */
 static void explain(const posterior *f, const real *theta, real *d, real *z)
 {
     real *part = work_of(f, 0);
-    memset(d, 0, sizeof(real) * (size_t)f->B), memset(z, 0, sizeof(real) * (size_t)f->B);
+    clear(d, (size_t)f->B);
+    clear(z, (size_t)f->B);
     for (int32_t i = 0; i < f->I + (f->exact ? 0 : f->J); i++) {
         const int32_t taps = i < f->I ? f->N : f->M;
-        correlate(part, theta, taps, history_of(f, i), f->B), add_to(i < f->I ? d : z, part, f->B);
+        correlate(part, theta, taps, history_of(f, i), f->B);
+        add_to(i < f->I ? d : z, part, f->B);
         theta += taps;
     }
 }
@@ -343,88 +415,129 @@ static int32_t collected(const posterior *f) { return f->delay / 2 + 1; }
 /* Return the blocks from an alarm to the end of the first fit. */
 static int32_t first_fit(const posterior *f) { return collected(f) + f->delay; }
 
-/* Return whether the error is beyond its noise, the usual misfit of the model, and what is not known yet. If so, note the limit. */
-static int is_alarm(const posterior *f, real unexplained, real d2, real q)
+/* Return the mean power over a block of what the draws say the errors may be. */
+static real power_of_doubt(const posterior *f)
 {
-    const posterior_numbers *known = f->numbers;
-    if (f->counts[AGE] <= (*f->alarms ? QUIET + first_fit(f) : 1) || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
-    const real limit = SURPRISE * q + larger(MISFIT, USUAL * root(known->misfit / known->seen)) * d2;
-    if (unexplained <= limit) return 0;
     real *d = work_of(f, 1), *z = work_of(f, 2), doubt = 0;
-    for (int32_t draw = 0; !f->exact && draw < DRAWS; draw++) {
+    for (int32_t draw = 0; draw < DRAWS; draw++) {
         explain(f, f->draws + times(draw, f->n), d, z);
         add_scaled(d, -1, z, f->B);
         doubt += dot(d, d, f->B) / (real)f->B;
     }
-    if (unexplained <= limit + SURPRISE * (doubt / (real)DRAWS)) return 0;
-    f->numbers->limit = limit, f->numbers->before = q, f->counts[WRONG] = 0;
+    return doubt / (real)DRAWS;
+}
+
+/* Return whether the error is beyond its noise, the usual misfit of the model, and what is not
+ * known yet. If so, note the limit. */
+static int is_alarm(const posterior *f, real unexplained, real d2, real q)
+{
+    posterior_numbers *known = f->numbers;
+    const int32_t rest = *f->alarms ? QUIET + first_fit(f) : 1;
+    if (f->counts[AGE] <= rest || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
+    const real usual = USUAL * root(known->misfit / known->seen);
+    const real limit = SURPRISE * q + larger(MISFIT, usual) * d2;
+    if (unexplained <= limit) return 0;
+    const real doubt = f->exact ? 0 : power_of_doubt(f);
+    if (unexplained <= limit + SURPRISE * doubt) return 0;
+    known->limit = limit;
+    known->before = q;
+    f->counts[WRONG] = 0;
     return 1;
 }
 
-/* Return whether no secondary path explains the errors after an alarm: then the primary paths have changed. */
+/* Return whether no secondary path explains the errors after an alarm: then the primary paths have
+ * changed. */
 static int is_wrong(posterior *f, real unexplained)
 {
     const int32_t fitted_for = f->counts[AGE] - first_fit(f);
-    if (f->exact || !(f->numbers->limit > 0) || fitted_for < FROM || fitted_for > TO) return 0;
-    f->counts[WRONG] += unexplained > f->numbers->limit;
+    const real limit = f->numbers->limit;
+    if (f->exact || !(limit > 0) || fitted_for < FROM || fitted_for > TO) return 0;
+    f->counts[WRONG] += unexplained > limit;
     return fitted_for == TO && f->counts[WRONG] >= MANY;
 }
 
-/* Begin anew after a change: the secondary paths return to their prior; of the data of the primary paths, some samples per tap
- * are kept. */
-static void begin_anew(posterior *f, real samples)
+/* Let the data of the primary paths count as `kept` of what they are, and drop those of the
+ * secondary paths, as if s had been known until now. */
+static void keep_data(posterior *f, real kept)
 {
     const int32_t n = f->n, split = f->I * f->N;
-    posterior_numbers *known = f->numbers;
-    const real kept = samples * (real)n < known->samples ? samples * (real)n / known->samples : 1;
     for (int32_t k = 0; k < f->K; k++) {
         real *r = f->r + times(k, n);
-        for (int32_t i = split; i < n; i++) { /* as if s had been known until now */
-            add_scaled(r, -f->theta[times(k, n) + (size_t)i], row_of_data(f, i), split);
+        const real *theta = f->theta + times(k, n);
+        for (int32_t i = split; i < n; i++) {
+            add_scaled(r, -theta[i], row_of_data(f, i), split);
             r[i] = 0;
         }
         for (int32_t i = 0; i < split; i++) r[i] *= kept;
     }
-    known->samples *= kept;
     for (int32_t i = 0; i < n; i++) {
         real *row = row_of_data(f, i);
         for (int32_t c = 0; c <= i; c++) row[c] = i < split ? kept * row[c] : 0;
     }
-    for (int32_t k = 0; k < f->K; k++) { /* sum e^2 = q samples + 2 theta'r - theta'G theta */
-        const real *theta = f->theta + times(k, n);
-        real energy = known->samples * f->q[k] + 2 * dot(theta, f->r + times(k, n), split);
-        for (int32_t i = 0; i < split; i++) energy -= theta[i] * (2 * dot(row_of_data(f, i), theta, i) + row_of_data(f, i)[i] * theta[i]);
-        f->ee[k] = energy;
+}
+
+/* Return sum e^2 = q samples + 2 theta'r - theta'G theta of microphone k. */
+static real energy_explained(const posterior *f, int32_t k)
+{
+    const int32_t split = f->I * f->N;
+    const real *theta = f->theta + times(k, f->n), *r = f->r + times(k, f->n);
+    real energy = f->numbers->samples * f->q[k] + 2 * dot(theta, r, split);
+    for (int32_t i = 0; i < split; i++) {
+        const real *row = row_of_data(f, i);
+        energy -= theta[i] * (2 * dot(row, theta, i) + row[i] * theta[i]);
     }
+    return energy;
+}
+
+/* Begin anew after a change: the secondary paths return to their prior; of the data of the primary
+ * paths, some samples per tap are kept. */
+static void begin_anew(posterior *f, real samples_per_tap)
+{
+    posterior_numbers *known = f->numbers;
+    const real samples = samples_per_tap * (real)f->n;
+    const real kept = samples < known->samples ? samples / known->samples : 1;
+    keep_data(f, kept);
+    known->samples *= kept;
+    for (int32_t k = 0; k < f->K; k++) f->ee[k] = energy_explained(f, k);
     known->fitted = 0;
-    if (!f->exact) known->spread = UNKNOWN;
-    f->counts[AGE] = f->counts[IDLE] = f->counts[PENDING] = 0, f->counts[DOUBTFUL] = f->counts[STALE] = 1;
-    if (!f->exact) memset(f->draws, 0, sizeof(real) * times(DRAWS, n));
+    f->counts[AGE] = f->counts[IDLE] = f->counts[PENDING] = 0;
+    f->counts[DOUBTFUL] = f->counts[STALE] = 1;
+    if (!f->exact) {
+        known->spread = UNKNOWN;
+        clear(f->draws, times(DRAWS, f->n));
+    }
     return_to_prior(f);
 }
 
-/* Let the part of G that is sum v(t - i) u(t - c), i < n, c < m, fade and take a block: along the diagonals of the sums, the
- * window of t moves by one sample. On the diagonal of G, v is u. */
-static void add_products(posterior *f, const real *v, int32_t at_v, int32_t n, const real *u, int32_t at_u, int32_t m, real sign, real forget)
+/* Let the part of G that is sum v(t - i) u(t - c), i < n, c < m, fade and take a block: along the
+ * diagonals of the sums, the window of t moves by one sample. On the diagonal of G, v is u. */
+static void add_products(posterior *f, const real *v, int32_t at_v, int32_t n, const real *u,
+                         int32_t at_u, int32_t m, real sign, real forget)
 {
     const int32_t B = f->B;
     real *column = work_of(f, 2), *last = work_of(f, 3), *next = work_of(f, 4);
     correlate(column, u, B, v, n); /* c = 0 */
-    if (v == u) last[0] = column[0];
-    else correlate(last, v, B, u, m); /* i = 0 */
+    if (v == u)
+        last[0] = column[0];
+    else
+        correlate(last, v, B, u, m); /* i = 0 */
     real *restrict first = row_of_data(f, at_v) + at_u;
-    for (int32_t c = 0; c < (v == u ? 1 : m); c++) first[c] = faded(first[c], forget, sign * last[c]);
+    for (int32_t c = 0; c < (v == u ? 1 : m); c++)
+        first[c] = faded(first[c], forget, sign * last[c]);
     for (int32_t i = 1; i < n; i++) {
         const int32_t columns = v == u ? i + 1 : m;
         real *restrict row = row_of_data(f, at_v + i) + at_u, *restrict sums = next;
         const real *restrict before = last;
         const real gone = v[B + i - 1], come = v[i - 1];
-        sums[0] = column[i], row[0] = faded(row[0], forget, sign * column[i]);
+        sums[0] = column[i];
+        row[0] = faded(row[0], forget, sign * column[i]);
         for (int32_t c = 1; c < columns; c++) {
             const real sum = before[c - 1] + (gone * u[B + c - 1] - come * u[c - 1]);
-            sums[c] = sum, row[c] = faded(row[c], forget, sign * sum);
+            sums[c] = sum;
+            row[c] = faded(row[c], forget, sign * sum);
         }
-        next = last, last = sums;
+        next = last;
+        last = sums;
     }
 }
 
@@ -433,8 +546,12 @@ static void add_block(posterior *f, real forget)
 {
     const int32_t regressors = f->I + (f->exact ? 0 : f->J), B = f->B;
     real *sums = work_of(f, 1);
-    f->numbers->fitted *= forget, f->numbers->samples = forget * f->numbers->samples + (real)B;
-    for (int32_t k = 0; k < f->K; k++) f->ee[k] = forget * f->ee[k] + dot(f->errors + times(k, B), f->errors + times(k, B), B);
+    f->numbers->fitted *= forget;
+    f->numbers->samples = forget * f->numbers->samples + (real)B;
+    for (int32_t k = 0; k < f->K; k++) {
+        const real *e = f->errors + times(k, B);
+        f->ee[k] = forget * f->ee[k] + dot(e, e, B);
+    }
     for (int32_t a = 0, row = 0; a < regressors; a++) {
         const int32_t n = a < f->I ? f->N : f->M;
         const real sign = a < f->I ? 1 : -1;
@@ -445,54 +562,97 @@ static void add_block(posterior *f, real forget)
         }
         for (int32_t b = 0, column = 0; b <= a; b++) {
             const int32_t m = b < f->I ? f->N : f->M;
-            add_products(f, history_of(f, a), row, n, history_of(f, b), column, m, b < f->I ? sign : -sign, forget);
+            add_products(f, history_of(f, a), row, n, history_of(f, b), column, m,
+                         b < f->I ? sign : -sign, forget);
             column += m;
         }
         row += n;
     }
 }
 
-/* Learn from a block whose errors are all known; at least as many samples as a primary path has taps have been heard. */
-static void learn_heard(posterior *f, real forget)
+/* Set the mean powers of what the posterior does not explain of a block, and of d^. If s^ is exact,
+ * add what is played to the errors, because it teaches nothing. */
+static void judge(posterior *f, real *unexplained, real *d2)
 {
     const int32_t B = f->B;
-    const real samples = (real)B * (real)f->K, q = mean_noise(f);
-    const int known = (real)f->heard[HEARD] / (real)B * (1 - forget) >= KNOWN;
-    real *part = work_of(f, 0), *d = work_of(f, 1), *z = work_of(f, 2), unexplained = 0, d2 = 0;
-    posterior_numbers *numbers = f->numbers;
+    const real samples = (real)B * (real)f->K;
+    real *part = work_of(f, 0), *d = work_of(f, 1), *z = work_of(f, 2);
+    *unexplained = *d2 = 0;
     for (int32_t k = 0; k < f->K; k++) {
         real *error = f->errors + times(k, B);
-        for (int32_t j = 0; f->exact && j < f->J; j++) /* s^ is exact: what is played teaches nothing */
-            correlate(part, f->path + times(k * f->J + j, f->M), f->M, history_of(f, f->I + j), B), add_to(error, part, B);
+        for (int32_t j = 0; f->exact && j < f->J; j++) {
+            const real *path = f->path + times(k * f->J + j, f->M);
+            correlate(part, path, f->M, history_of(f, f->I + j), B);
+            add_to(error, part, B);
+        }
         explain(f, f->theta + times(k, f->n), d, z);
-        d2 += dot(d, d, B);
+        *d2 += dot(d, d, B);
         for (int32_t t = 0; t < B; t++) d[t] = error[t] - d[t] + z[t];
-        unexplained += dot(d, d, B);
+        *unexplained += dot(d, d, B);
     }
-    unexplained /= samples, d2 /= samples;
-    int loud = 0;
-    for (int32_t j = 0; j < f->J; j++)
-        for (int32_t t = 0; t < B + f->M - 1; t++) loud |= history_of(f, f->I + j)[t] != 0;
-    count_up(f->counts + AGE), count_up(f->counts + IDLE);
-    if (loud && !f->counts[SOUNDS]) f->counts[SOUNDS] = f->counts[AGE] = 1;
-    const int alarm = known && loud && is_alarm(f, unexplained, d2, q);
-    if (alarm) {
+    *unexplained /= samples;
+    *d2 /= samples;
+}
+
+/* Return whether the loudspeakers sound in a block, or in what the secondary paths still hold. */
+static int is_loud(const posterior *f)
+{
+    for (int32_t j = 0; j < f->J; j++) {
+        const real *y = history_of(f, f->I + j);
+        for (int32_t t = 0; t < f->B + f->M - 1; t++)
+            if (y[t] != 0) return 1;
+    }
+    return 0;
+}
+
+/* Begin anew if the plant has changed, else follow the usual misfit. Return whether this block is
+ * that of a change. */
+static int notice_change(posterior *f, real forget, int loud, real unexplained, real d2, real q)
+{
+    posterior_numbers *numbers = f->numbers;
+    const int known = (real)f->heard[HEARD] / (real)f->B * (1 - forget) >= KNOWN;
+    if (known && loud && is_alarm(f, unexplained, d2, q)) {
         count_up(f->alarms);
         begin_anew(f, f->exact ? FORGOTTEN : KEPT);
-    } else if (is_wrong(f, unexplained)) {
+        return 1;
+    }
+    if (is_wrong(f, unexplained)) {
         begin_anew(f, FORGOTTEN);
         for (int32_t k = 0; k < f->K; k++) f->q[k] = numbers->before;
         numbers->limit = 0; /* only once per alarm */
-    }
-    else if (known && *f->fits && d2 > 0 && !f->counts[DOUBTFUL]) {
+    } else if (known && *f->fits && d2 > 0 && !f->counts[DOUBTFUL]) {
         const real share = unexplained < d2 ? unexplained / d2 : 1;
         numbers->misfit = forget * forget * numbers->misfit + share * share;
         numbers->seen = forget * forget * numbers->seen + 1;
     }
-    if (!alarm) add_block(f, forget); /* the block of a change is of two plants */
-    const int due = !f->counts[PENDING] && (!f->counts[DOUBTFUL] || f->counts[AGE] >= collected(f));
-    const int news = numbers->samples - numbers->fitted > numbers->samples / 8 || (f->counts[SOUNDS] && f->counts[AGE] <= 16);
-    if (due && (news || (unexplained > 2 * q && f->counts[IDLE] >= 8))) begin_fit(f);
+    return 0;
+}
+
+/* Return whether a fit should begin: there is much news, or the last one explains too little. */
+static int is_due(const posterior *f, real unexplained, real q)
+{
+    const int32_t *counts = f->counts;
+    const real samples = f->numbers->samples;
+    if (counts[PENDING] || (counts[DOUBTFUL] && counts[AGE] < collected(f))) return 0;
+    if (counts[SOUNDS] && counts[AGE] <= 16) return 1;
+    if (samples - f->numbers->fitted > samples / 8) return 1;
+    return unexplained > 2 * q && counts[IDLE] >= 8;
+}
+
+/* Learn from a block whose errors are all known; at least as many samples as a primary path has
+ * taps have been heard. */
+static void learn_heard(posterior *f, real forget)
+{
+    const real q = mean_noise(f);
+    const int loud = is_loud(f);
+    real unexplained, d2;
+    judge(f, &unexplained, &d2);
+    count_up(f->counts + AGE);
+    count_up(f->counts + IDLE);
+    if (loud && !f->counts[SOUNDS]) f->counts[SOUNDS] = f->counts[AGE] = 1;
+    /* The block of a change is of two plants: it is not learned from. */
+    if (!notice_change(f, forget, loud, unexplained, d2, q)) add_block(f, forget);
+    if (is_due(f, unexplained, q)) begin_fit(f);
     if (f->counts[PENDING]) go_on_fitting(f);
 }
 
@@ -505,9 +665,9 @@ void learn(posterior *f, real forget)
 /* Set `to` to a with zeros around it, `more` on either side. */
 static const real *widened(real *to, const real *a, int32_t n, int32_t more)
 {
-    memset(to, 0, sizeof(real) * (size_t)more);
-    memcpy(to + more, a, sizeof(real) * (size_t)n);
-    memset(to + more + n, 0, sizeof(real) * (size_t)more);
+    clear(to, (size_t)more);
+    copy(to + more, a, (size_t)n);
+    clear(to + more + n, (size_t)more);
     return to;
 }
 
@@ -524,7 +684,8 @@ static void expect_also(posterior *f, const real *theta, real weight)
     real *wide = work_of(f, 1), *sums = work_of(f, 2), *turned = work_of(f, 3);
     for (int32_t j = 0; j < J; j++)
         for (int32_t a = 0; a <= j; a++) {
-            correlate(sums, s + times(a, M), M, widened(wide, s + times(j, M), M, M - 1), 2 * M - 1);
+            correlate(sums, s + times(a, M), M, widened(wide, s + times(j, M), M, M - 1),
+                      2 * M - 1);
             add_scaled(f->ss + times(j * J + a, 2 * M - 1), weight, sums, 2 * M - 1);
         }
     for (int32_t i = 0; i < I; i++) {
@@ -541,24 +702,28 @@ static void expect_also(posterior *f, const real *theta, real weight)
 void expect(posterior *f)
 {
     const int32_t I = f->I, J = f->J, N = f->N, M = f->M, lags = 2 * M - 1;
-    memset(f->ss, 0, sizeof(real) * times(J * J, lags));
-    memset(f->ps, 0, sizeof(real) * times(I * J, N + M - 1));
-    for (int32_t k = 0; k < f->K; k++) {
-        const real *p = f->theta + times(k, f->n);
-        if (f->exact) { /* theta has no s: put it beside p */
-            real *both = f->sides;
-            memcpy(both, p, sizeof(real) * times(I, N));
-            memcpy(both + times(I, N), f->path + times(k * J, M), sizeof(real) * times(J, M));
-            expect_also(f, both, 1);
-        } else expect_also(f, p, 1);
-    }
-    for (int32_t draw = 0; !f->exact && draw < DRAWS; draw++) /* of the mean noise */
-        expect_also(f, f->draws + times(draw, f->n), (real)f->K / (real)DRAWS);
+    const real share = (real)f->K / (real)DRAWS; /* the draws are of the mean noise */
     const real doubt = (real)f->K * UNKNOWN * UNKNOWN * size_of_path(f);
+    clear(f->ss, times(J * J, lags));
+    clear(f->ps, times(I * J, N + M - 1));
+    for (int32_t k = 0; k < f->K; k++) {
+        const real *theta = f->theta + times(k, f->n);
+        if (f->exact) { /* theta has no s: put it after p */
+            real *both = f->sides;
+            copy(both, theta, times(I, N));
+            copy(both + times(I, N), f->path + times(k * J, M), times(J, M));
+            theta = both;
+        }
+        expect_also(f, theta, 1);
+    }
+    for (int32_t draw = 0; !f->exact && draw < DRAWS; draw++)
+        expect_also(f, f->draws + times(draw, f->n), share);
     for (int32_t j = 0; j < J; j++) {
-        for (int32_t a = 0; a < j; a++) reverse(f->ss + times(a * J + j, lags), f->ss + times(j * J + a, lags), lags);
+        for (int32_t a = 0; a < j; a++)
+            reverse(f->ss + times(a * J + j, lags), f->ss + times(j * J + a, lags), lags);
         /* Not yet verified: anything may be wrong, even the polarity. */
-        if (!f->exact && f->counts[DOUBTFUL]) f->ss[times(j * J + j, lags) + (size_t)(M - 1)] += doubt;
+        if (!f->exact && f->counts[DOUBTFUL])
+            f->ss[times(j * J + j, lags) + (size_t)(M - 1)] += doubt;
     }
     f->counts[STALE] = 0;
 }

@@ -1,4 +1,5 @@
-/* Tells from which sources a library was built: `stamp` of building.py computes the text, library.py compares it. */
+/* Tells from which sources a library was built: `stamp` of building.py computes the text,
+ * library.py compares it. */
 #include "anc.h"
 
 #ifndef ANC_STAMP

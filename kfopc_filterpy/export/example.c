@@ -1,4 +1,5 @@
-/* Runs $source: the self-test, then some samples of noise. Put your converters where the comments say so. */
+/* Runs $source: the self-test, then some samples of noise. Put your converters where the comments
+ * say so. */
 #include "$header"
 
 #include <stdio.h>
@@ -25,7 +26,8 @@ int main(void)
         $control
         for (int j = 0; j < ${NAME}_LOUDSPEAKERS; j++) /* y(n), to the amplifiers */
             if (y[j] > loudest) loudest = y[j];
-        for (int k = 0; k < ${NAME}_MICROPHONES; k++) e[k] = x[0] / 4; /* e(n), from the error microphones */
+        for (int k = 0; k < ${NAME}_MICROPHONES; k++) /* e(n), from the error microphones */
+            e[k] = x[0] / 4;
         if ($update != ${NAME}_ADAPTED) refused++;
     }
     printf("%d samples, largest y %g, %d updates refused\n", SAMPLES, (double)loudest, refused);

@@ -1,7 +1,7 @@
 /* The controller of $source as a unit of FMI 3.0 for co-simulation.
  *
- * A step is a sample: the error e is what the last control signal left, then the reference x gives the next one. So the
- * outputs do not depend on the inputs of the same moment. */
+ * A step is a sample: the error e is what the last control signal left, then the reference x gives
+ * the next one. So the outputs do not depend on the inputs of the same moment. */
 #include "$header"
 
 #include "fmi3Functions.h"
@@ -9,8 +9,13 @@
 #include <stdlib.h>
 #include <string.h>
 
+#ifdef __GNUC__ /* the standard says which parameters a function has */
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#endif
+
 enum { I = ${NAME}_REFERENCES, K = ${NAME}_MICROPHONES, J = ${NAME}_LOUDSPEAKERS };
-/* Value references: the time, then x, e and y of all channels, and after them what the update returned. */
+/* Value references: the time, then x, e and y of all channels, and after them what the update
+ * returned. */
 enum { TIME, X, E = X + I, Y = E + K, ANSWER = Y + J };
 static const double PERIOD = $period;
 
@@ -41,20 +46,21 @@ static void begin(model *now)
 
 const char *fmi3GetVersion(void) { return fmi3Version; }
 
-fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible,
-                                         fmi3Boolean logging, fmi3Boolean events, fmi3Boolean early,
-                                         const fmi3ValueReference intermediate[], size_t n_intermediate,
-                                         fmi3InstanceEnvironment environment, fmi3LogMessageCallback log,
-                                         fmi3IntermediateUpdateCallback update)
+fmi3Instance fmi3InstantiateCoSimulation(
+    fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible,
+    fmi3Boolean logging, fmi3Boolean events, fmi3Boolean early,
+    const fmi3ValueReference intermediate[], size_t n_intermediate,
+    fmi3InstanceEnvironment environment, fmi3LogMessageCallback log,
+    fmi3IntermediateUpdateCallback update)
 {
     unit *one = token && !strcmp(token, "$token") ? malloc(sizeof *one) : NULL;
-    (void)name, (void)resources, (void)visible, (void)logging, (void)events, (void)early, (void)intermediate;
-    (void)n_intermediate, (void)update;
     if (!one) {
-        if (log) log(environment, fmi3Error, "logStatusError", "the token is that of another unit, or no memory is left");
+        const char *why = "the token is that of another unit, or no memory is left";
+        if (log) log(environment, fmi3Error, "logStatusError", why);
         return NULL;
     }
-    one->environment = environment, one->log = log;
+    one->environment = environment;
+    one->log = log;
     begin(&one->now);
     return one;
 }
@@ -67,25 +73,27 @@ fmi3Status fmi3Reset(fmi3Instance instance)
     return fmi3OK;
 }
 
-fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean has_tolerance, fmi3Float64 tolerance,
-                                       fmi3Float64 start, fmi3Boolean has_end, fmi3Float64 end)
+fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean has_tolerance,
+                                       fmi3Float64 tolerance, fmi3Float64 start,
+                                       fmi3Boolean has_end, fmi3Float64 end)
 {
-    (void)has_tolerance, (void)tolerance, (void)has_end, (void)end;
     ((unit *)instance)->now.value[TIME] = ($real)start;
     return fmi3OK;
 }
 
-fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) { (void)instance; return fmi3OK; }
-fmi3Status fmi3EnterStepMode(fmi3Instance instance) { (void)instance; return fmi3OK; }
-fmi3Status fmi3Terminate(fmi3Instance instance) { (void)instance; return fmi3OK; }
+fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) { return fmi3OK; }
+fmi3Status fmi3EnterStepMode(fmi3Instance instance) { return fmi3OK; }
+fmi3Status fmi3Terminate(fmi3Instance instance) { return fmi3OK; }
 
-fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t n, const fmi3String categories[])
+fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t n,
+                               const fmi3String categories[])
 {
-    (void)instance, (void)on, (void)n, (void)categories; /* errors are always logged */
+    /* errors are always logged */
     return fmi3OK;
 }
 
-fmi3Status fmi3Get$number(fmi3Instance instance, const fmi3ValueReference at[], size_t n, fmi3$number values[], size_t n_values)
+fmi3Status fmi3Get$number(fmi3Instance instance, const fmi3ValueReference at[], size_t n,
+                          fmi3$number values[], size_t n_values)
 {
     unit *one = instance;
     if (n != n_values) return refused(one, "a variable has one value");
@@ -96,7 +104,8 @@ fmi3Status fmi3Get$number(fmi3Instance instance, const fmi3ValueReference at[], 
     return fmi3OK;
 }
 
-fmi3Status fmi3GetInt32(fmi3Instance instance, const fmi3ValueReference at[], size_t n, fmi3Int32 values[], size_t n_values)
+fmi3Status fmi3GetInt32(fmi3Instance instance, const fmi3ValueReference at[], size_t n,
+                        fmi3Int32 values[], size_t n_values)
 {
     unit *one = instance;
     for (size_t i = 0; i < n; i++) {
@@ -106,7 +115,8 @@ fmi3Status fmi3GetInt32(fmi3Instance instance, const fmi3ValueReference at[], si
     return fmi3OK;
 }
 
-fmi3Status fmi3Set$number(fmi3Instance instance, const fmi3ValueReference at[], size_t n, const fmi3$number values[], size_t n_values)
+fmi3Status fmi3Set$number(fmi3Instance instance, const fmi3ValueReference at[], size_t n,
+                          const fmi3$number values[], size_t n_values)
 {
     unit *one = instance;
     if (n != n_values) return refused(one, "a variable has one value");
@@ -117,19 +127,22 @@ fmi3Status fmi3Set$number(fmi3Instance instance, const fmi3ValueReference at[], 
     return fmi3OK;
 }
 
-fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 time, fmi3Float64 step, fmi3Boolean no_set_before,
-                      fmi3Boolean *events, fmi3Boolean *terminate, fmi3Boolean *early, fmi3Float64 *last)
+fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 time, fmi3Float64 step,
+                      fmi3Boolean no_set_before, fmi3Boolean *events, fmi3Boolean *terminate,
+                      fmi3Boolean *early, fmi3Float64 *last)
 {
     unit *one = instance;
     model *now = &one->now;
     $real *x = now->value + X, *e = now->value + E, *y = now->value + Y;
-    (void)no_set_before;
-    *events = *terminate = *early = fmi3False, *last = time;
-    if (!(fabs(step - PERIOD) <= 1e-6 * PERIOD)) return refused(one, "a step must be a sample, $period s");
+    *events = *terminate = *early = fmi3False;
+    *last = time;
+    if (!(fabs(step - PERIOD) <= 1e-6 * PERIOD))
+        return refused(one, "a step must be a sample, $period s");
     if (now->begun) now->answer = $update;
     now->begun = 1;
     $control
-    now->value[TIME] = ($real)(*last = time + step);
+    *last = time + step;
+    now->value[TIME] = ($real)*last;
     return fmi3OK;
 }
 
@@ -147,13 +160,12 @@ fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState state)
 {
     model *now = &((unit *)instance)->now;
     memcpy(now, state, sizeof *now);
-    now->controller.opened = NULL; /* the addresses in it are those of another place, or of another process */
+    now->controller.opened = NULL; /* its addresses are those of another place, or process */
     return fmi3OK;
 }
 
 fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *state)
 {
-    (void)instance;
     free(*state);
     *state = NULL;
     return fmi3OK;
@@ -161,19 +173,20 @@ fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *state)
 
 fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState state, size_t *size)
 {
-    (void)instance, (void)state;
     *size = sizeof(model);
     return fmi3OK;
 }
 
-fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState state, fmi3Byte bytes[], size_t size)
+fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState state, fmi3Byte bytes[],
+                                 size_t size)
 {
     if (size != sizeof(model)) return refused(instance, "a serialized state has another size");
     memcpy(bytes, state, size);
     return fmi3OK;
 }
 
-fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte bytes[], size_t size, fmi3FMUState *state)
+fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte bytes[], size_t size,
+                                   fmi3FMUState *state)
 {
     if (size != sizeof(model)) return refused(instance, "a serialized state has another size");
     if (!*state) *state = malloc(size);
@@ -183,7 +196,3 @@ fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte bytes[]
 }
 
 /* What the standard names beyond that, and a unit must define too. */
-
-#ifdef __GNUC__
-#pragma GCC diagnostic ignored "-Wunused-parameter"
-#endif

@@ -143,7 +143,6 @@ class Exported:
             "all": shape.references,
             "modelled": shape.modelled,
             "guard": ".guard = guard, " if fields["guard"].size else "",
-            "limited": int(bool(shape.limiter_windows)),
         }
 
     def _stretches(self) -> str:

@@ -1,7 +1,8 @@
 /* $description. See $header.
  *
- * First the files of kfopc_filterpy's core (MIT licence, sources $stamp), in which only the includes were
- * resolved and everything made static. After them: the plan, the state of the export, the calls. */
+ * First the files of kfopc_filterpy's core (MIT licence, sources $stamp), in which only
+ * the includes were resolved and everything made static. After them: the plan, the state of the
+ * export, the calls. */
 #ifdef __cplusplus
 #error "compile this file as C99; C++ can include its header"
 #endif
@@ -21,11 +22,20 @@ $core
 
 $constants
 static const anc_plan plan = {
-    .scenarios = 1, .microphones = $K, .loudspeakers = $J, .references = $all, .taps = $L, .path_taps = $M, .guard_taps = $G,
-    .limited = $limited, .modelled = $modelled, $windows.path = path, $guard.settings = settings,
+    .scenarios = 1,
+    .microphones = $K,
+    .loudspeakers = $J,
+    .references = $all,
+    .taps = $L,
+    .path_taps = $M,
+    .guard_taps = $G,
+    .modelled = $modelled,
+    $windows.path = path,
+    $guard.settings = settings,
 };
 
-/* The state of the export: where it differs from a fresh block, `count` elements of a field from `first` on. */
+/* The state of the export: where it differs from a fresh block, `count` elements of a field from
+ * `first` on. */
 typedef struct {
     const char *field;
     int32_t first, count;
@@ -43,27 +53,40 @@ $expected};
 
 typedef char view_has_room[sizeof(anc_view) == sizeof(((${name}_state *)0)->view) ? 1 : -1];
 
-static void fill(void *to, const char *name, anc_role role, anc_type type, size_t offset, const int32_t shape[4])
+static void fill(void *to, const char *name, anc_role role, anc_type type, size_t offset,
+                 const int32_t shape[4])
 {
     const size_t size = type == ANC_IS_REAL ? sizeof(real) : sizeof(int32_t);
-    (void)role, (void)shape;
-    for (const stretch *s = initial; s->field; s++)
-        if (!strcmp(s->field, name))
-            memcpy((char *)to + offset + size * (size_t)s->first, s->values, size * (size_t)s->count);
+    (void)role;
+    (void)shape;
+    for (const stretch *s = initial; s->field; s++) {
+        char *field = (char *)to + offset + size * (size_t)s->first;
+        if (!strcmp(s->field, name)) memcpy(field, s->values, size * (size_t)s->count);
+    }
 }
 
 typedef struct { char before; ${name}_state state; } placed; /* a state where its type may stand */
 static const uint32_t mark = $mark; /* in every state of this export */
 
-static int usable(const void *state) { return state && (uintptr_t)state % offsetof(placed, state) == 0; }
+static int usable(const void *state)
+{
+    return state && (uintptr_t)state % offsetof(placed, state) == 0;
+}
+
+/* Find the fields of a state, and set them to those of the export if it is fresh. */
+static anc_view *opened(${name}_state *state, int fresh)
+{
+    anc_view *view = (anc_view *)state->view;
+    anc_open(&ALGORITHM, &plan, view, state->block, sizeof state->block, fresh);
+    state->opened = state;
+    return view;
+}
 
 /* Return the view of a usable state; a copy of a state gets its own when it is first used. */
 static anc_view *view_of(${name}_state *state)
 {
     if (state->mark != mark) ${name}_init(state);
-    if (state->opened != state) anc_open(&ALGORITHM, &plan, (anc_view *)state->view, state->block, sizeof state->block, 0);
-    state->opened = state;
-    return (anc_view *)state->view;
+    return state->opened == state ? (anc_view *)state->view : opened(state, 0);
 }
 
 /* Set y for x. Time goes on where x is refused: it counts as silence. */
@@ -92,9 +115,8 @@ static int adapt(${name}_state *state, const real *e)
 void ${name}_init(${name}_state *state)
 {
     if (!usable(state)) return;
-    anc_open(&ALGORITHM, &plan, (anc_view *)state->view, state->block, sizeof state->block, 1);
+    opened(state, 1);
     anc_describe(&ALGORITHM, &plan, fill, state->block);
-    state->opened = state;
     state->fault = 0;
     state->mark = mark;
 }

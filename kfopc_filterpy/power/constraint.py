@@ -17,11 +17,13 @@ DEFAULT_MEMORY_S = 0.5
 
 
 # Structures of the core, see anc.h.
-_MEANS = ("disturbance", "filtered_reference", "reference")
 POWER = np.dtype([(name, np.float64) for name in ("mean_square", "lap", "taken", "position")])
 SETTINGS = ("rated_power", "rate", "supplied_factor", "supplied_power", "supplied_gain")  # NaN if not supplied
 NUMBERS = np.dtype([(name, np.float64) for name in (*SETTINGS, "factor", "power", "gain")])
-PREVIEWED = np.dtype([(name, np.float64) for name in ("factor", "power", "gain", *(f"mean_{name}" for name in _MEANS))])
+PREVIEWED = np.dtype(
+    [(name, np.float64, 3) for name in ("square", "mean")]
+    + [(name, np.float64) for name in ("factor", "power", "gain")]
+)
 
 
 class ConstraintState(NamedTuple):
@@ -37,7 +39,7 @@ class _Room:
 
     def __init__(self, state: ConstraintState) -> None:
         self.previewed = np.zeros(1, PREVIEWED)
-        self.squares = 0.0, 0.0, math.nan  # of the sample
+        self.previewed["square"] = 0.0, 0.0, math.nan
         powers, window, numbers, previewed = (array.ctypes.data for array in (*state, self.previewed))
         self.places = numbers, powers, window, state.window.shape[1], previewed
 
@@ -169,7 +171,7 @@ class OutputPowerConstraint:
     def accept(self) -> float:
         """Add the sample of the last `preview` to the powers and return the constraint factor."""
         room = self._opened()
-        commit(*room.places, *room.squares)
+        commit(*room.places)
         return float(self._state.numbers["factor"][0])
 
     def advance(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
@@ -203,8 +205,8 @@ class OutputPowerConstraint:
         `d_squared`, `xf_squared` and `x_squared` are those of `preview`'s arguments.
         """
         room = self._opened()
-        room.squares = d_squared, xf_squared, self._known(x_squared)
-        preview(*room.places, *room.squares)
+        room.previewed["square"] = d_squared, xf_squared, self._known(x_squared)
+        preview(*room.places)
         return float(room.previewed["factor"][0])
 
     @property

@@ -85,14 +85,14 @@ int main(int argc, char **argv)
         const int32_t number = below(known);
         const anc_algorithm *a = algorithms[number].algorithm;
         anc_plan plan = {.scenarios = any_count(MOST), .microphones = any_count(MOST), .loudspeakers = any_count(MOST), .references = any_count(MOST),
-                         .taps = any_count(LONGEST), .path_taps = any_count(LONGEST), .guard_taps = below(2) ? any_count(48) : 0, .limited = below(2),
+                         .taps = any_count(LONGEST), .path_taps = any_count(LONGEST), .guard_taps = below(2) ? any_count(48) : 0,
                          .modelled = !below(4)};
         const int tidy = below(2); /* so that many plans are not refused */
         int32_t windows[2][MOST * MOST];
         for (int32_t j = 0; j < MOST * MOST; j++) windows[0][j] = below(3) ? any_count(LONGEST) : 0, windows[1][j] = any_count(LONGEST);
         plan.power_windows = below(2) ? windows[0] : NULL;
-        plan.limiter_windows = plan.limited ? windows[1] : NULL;
-        if (plan.loudspeakers > MOST || plan.scenarios > MOST) plan.power_windows = plan.limiter_windows = NULL, plan.limited = 0;
+        plan.limiter_windows = below(2) ? windows[1] : NULL;
+        if (plan.loudspeakers > MOST || plan.scenarios > MOST) plan.power_windows = plan.limiter_windows = NULL;
         anc_real settings[8 * (MOST + 1)], *value = settings;
         const int few = plan.scenarios <= MOST && plan.loudspeakers <= MOST && plan.microphones <= MOST;
         for (int s = 0; few && a->settings[s].name; s++)

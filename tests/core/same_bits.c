@@ -85,7 +85,7 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int equipped)
     const anc_amplifier amplifiers[MOST] = {{ANC_SOFT_SATURATION, 0.5f, 1.75f}, {ANC_HARD_CLIP, 0.5f, 1}, {ANC_LINEAR, 1, 1}};
     controller c = {.algorithm = algorithms[number].algorithm};
     const anc_plan plan = {.scenarios = 1, .microphones = K, .loudspeakers = J, .references = I, .taps = TAPS, .path_taps = PATH,
-                           .guard_taps = equipped ? GUARD : 0, .limited = equipped, .power_windows = equipped ? power_windows : NULL,
+                           .guard_taps = equipped ? GUARD : 0, .power_windows = equipped ? power_windows : NULL,
                            .limiter_windows = equipped ? windows : NULL, .path = estimated, .guard = guard, .settings = settings};
     anc_plant plant = {.scenarios = 1, .microphones = K, .loudspeakers = J, .references = I, .path_taps = PATH, .feedback_taps = equipped ? PATH : 0,
                        .at = 3 * PATH + 64, .length = 4 * PATH + 64, .path = path, .feedback = feedback, .amplifiers = amplifiers,

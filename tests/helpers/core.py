@@ -41,11 +41,11 @@ ALGORITHMS: dict[str, Mapping[str, float]] = {
 }
 
 
-def exported() -> list[str]:
-    """Return the names of the algorithms that anc.h declares, without ``anc_``."""
+def exported(kind: str = "algorithm") -> list[str]:
+    """Return the names of the constants of a type, by default the algorithms, that anc.h declares, without ``anc_``."""
     text = (building.FOLDER / "anc.h").read_text(encoding="utf-8")
-    (names,) = re.findall(r"^extern ANC_PUBLIC const anc_algorithm ([^;]+);", text, re.M)
-    return [name.strip().removeprefix("anc_") for name in names.split(",")]
+    lists = re.findall(rf"^extern ANC_PUBLIC const anc_{kind} ([^;]+);", text, re.M)
+    return [name.strip().removeprefix("anc_") for names in lists for name in names.split(",")]
 
 
 def known() -> list[str]:
