@@ -25,9 +25,9 @@
  * that much, it is 0.
  *
  * A state that was never initialised, zeroed or not, or that is of another export, is initialised
- * by its first call. One that is NULL, or not aligned as its type must be, is left alone: the output
- * is 0, and ${name}_update returns ${NAME}_NO_STATE. C++ can include this header; the source file is
- * C.
+ * by its first call. One that is NULL, or not aligned as its type must be, is left alone: the
+ * output is 0, and ${name}_update returns ${NAME}_NO_STATE. C++ can include this header; the source
+ * file is C.
  */
 #ifndef ${NAME}_EXPORTED_H
 #define ${NAME}_EXPORTED_H
