@@ -16,28 +16,27 @@ from .library import Field, Library, at_cache_line, constant, fields_of, load
 
 _STATE, _SETTING, _SCRATCH = range(3)
 _PRECISIONS: dict[str, np.dtype[Any]] = {"double": np.dtype(np.float64), "float": np.dtype(np.float32)}
-_VIEW_PLACES = 128
+_VIEW_PLACES = 128  # of `anc_view` in anc.h
 SLACK = 64  # of delay lines, see signals.c
 _EACH = ("", "loudspeakers", "microphones")
 _step = ctypes.PYFUNCTYPE  # keeps the interpreter's lock
 
 LOUDEST, LOUDEST_LEARNT = constant("loudest"), constant("loudest_learnt")  # limits, see anc.h
 
-# What a step that was refused says: `anc_answer` in anc.h. Nothing was changed then.
-LOUD_REFERENCE, LOUD_ERROR, LOUD_ESTIMATE, LOUD_STEP, NO_SOLUTION = range(1, 6)
 
-
-def reasons(real: str = "double") -> dict[int, str]:
-    """Return why a step is refused, by its answer, for a type of numbers."""
+def reasons(real: str = "double") -> tuple[str, ...]:
+    """Return why a step was refused, by its answer (`anc_answer` in anc.h), for a type of numbers."""
     names = ("loudest", "loudest_reference", "loudest_learnt", "longest_step")
     loudest, reference, learnt, step = (f"1e{math.log10(constant(name, real)):.0f}" for name in names)
-    return {
-        LOUD_REFERENCE: f"the reference is too loud, above {reference} over the gain of the secondary path: scale the signals",
-        LOUD_ERROR: f"the error is too loud, above {loudest}: scale the signals",
-        LOUD_ESTIMATE: f"the disturbance estimate e + s^ * y is too loud, above {loudest}, or {learnt} with an internal model: scale the signals",
-        LOUD_STEP: f"the step of the weights is too large, above {step}: use a smaller step size",
-        NO_SOLUTION: "the covariance P is too large: S = x' P x' + q could overflow",
-    }
+    return (
+        "",
+        f"the reference is too loud, above {reference} over the gain of the secondary path: scale the signals",
+        f"the error is too loud, above {loudest}: scale the signals",
+        f"the disturbance estimate e + s^ * y is too loud, above {loudest}, or {learnt} with an internal model: scale the "
+        "signals",
+        f"the step of the weights is too large, above {step}: use a smaller step size",
+        "the covariance P is too large: S = x' P x' + q could overflow",
+    )
 
 
 REASONS = reasons()
@@ -99,12 +98,14 @@ class Algorithm:
         except ValueError:
             raise ValueError(f"the core has no algorithm anc_{name}") from None
         self.pointer = ctypes.addressof(self._struct)
-        self.settings: list[Setting] = []
-        if real == "float":  # whose table has floats in it, where `_Setting` has doubles
-            self.settings = Algorithm(name).settings
-            return
-        while (name_of := self._struct.settings[len(self.settings)].name) is not None:
-            self.settings.append(Setting(name_of.decode(), _EACH[self._struct.settings[len(self.settings)].each]))
+        self.settings: list[Setting] = Algorithm(name).settings if real == "float" else self._settings()
+
+    def _settings(self) -> list[Setting]:
+        """Return the settings of the table; one for float has other sizes than `_Setting`."""
+        settings: list[Setting] = []
+        while (one := self._struct.settings[len(settings)]).name is not None:
+            settings.append(Setting(one.name.decode(), _EACH[one.each]))
+        return settings
 
     @property
     def steps(self) -> tuple[int, int, int]:
@@ -248,20 +249,27 @@ class Block:
         self.address = ctypes.addressof(self._view)
         if not self._library.anc_open(*described, self._view, self.memory.ctypes.data, size, state is None):
             raise ValueError(f"a setting or a path of {algorithm.name} is out of its range: {settings}")
+        self._name_fields(layout)
+        self._bind_steps()
+
+    def _name_fields(self, layout: list[Field]) -> None:
         self.fields: dict[str, NDArray[Any]] = {}
         names: dict[int, list[str]] = {_STATE: [], _SETTING: [], _SCRATCH: []}
         for name, role, kind, offset, axes in layout:
-            dtype = (algorithm.precision, np.dtype(np.int32))[kind]
+            dtype = (self.algorithm.precision, np.dtype(np.int32))[kind]
             self.fields[name] = np.frombuffer(self.memory, dtype, int(np.prod(axes)), offset).reshape(axes)
             names[role].append(name)
         self.states, self.scratch = names[_STATE], names[_SCRATCH]
+
+    def _bind_steps(self) -> None:
+        """Make the arrays of a sample, and the steps' functions, whose arguments are always the same."""
+        shape, pointer = self.shape, ctypes.c_void_p
         given = shape.references - shape.modelled * shape.microphones
         counts = (given, shape.scenarios * shape.loudspeakers, shape.scenarios * shape.microphones)
-        self.reference, self.control_signal, self.error = (np.zeros(n, algorithm.precision) for n in counts)
-        control, update, take_error = algorithm.steps
-        pointers = (ctypes.c_void_p,) * 3
-        self._control = _step(ctypes.c_int, *pointers)(control)
-        self._update, self._take_error = (_step(ctypes.c_int, *pointers[:2])(one) for one in (update, take_error))
+        self.reference, self.control_signal, self.error = (np.zeros(n, self.algorithm.precision) for n in counts)
+        control, update, take_error = self.algorithm.steps
+        self._control = _step(ctypes.c_int, pointer, pointer, pointer)(control)
+        self._update, self._take_error = (_step(ctypes.c_int, pointer, pointer)(one) for one in (update, take_error))
         x, y, e = (array.ctypes.data for array in (self.reference, self.control_signal, self.error))
         self._emitted, self._updated = (self.address, x, y), (self.address, e)
 

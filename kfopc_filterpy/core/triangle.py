@@ -15,22 +15,14 @@ OWED = np.dtype(
 
 def full_covariance(triangle: np.ndarray, u: np.ndarray, scale: float, diagonal: float, weight: float) -> np.ndarray:
     """Return the full symmetric array scale T + weight u u' + diagonal I."""
-    n = u.size
+    n, begin = u.size, 0
     padded = -(-n // GROUP) * GROUP
     P = np.empty((padded, padded))
-    for rows, group in _groups(triangle, n):
-        P[group : group + GROUP, : group + GROUP] = rows
-        P[:group, group : group + GROUP] = rows[:, :group].T
+    for end in range(GROUP, padded + 1, GROUP):  # rows that end with this column
+        rows = triangle[begin : begin + GROUP * end].reshape(GROUP, end)
+        P[end - GROUP : end, :end] = rows
+        P[:end, end - GROUP : end] = rows.T
+        begin += rows.size
     P = P[:n, :n] * scale + weight * np.multiply.outer(u, u)
     P[np.diag_indices(n)] += diagonal
     return P
-
-
-def _groups(triangle: np.ndarray, n: int) -> list[tuple[np.ndarray, int]]:
-    """Return views of the groups of rows of T, each with its first row's index."""
-    groups, at = [], 0
-    for group in range(0, n, GROUP):
-        size = GROUP * (group + GROUP)
-        groups.append((triangle[at : at + size].reshape(GROUP, -1), group))
-        at += size
-    return groups
