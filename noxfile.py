@@ -148,7 +148,7 @@ def older_filterpy(session: nox.Session) -> None:
     """Run the estimator's tests on filterpy 1.4.5."""
     session.install(*PINNED, "-e", ".[test]")
     session.install("--no-deps", "filterpy==1.4.5")
-    kinds = ("estimator", "random_walk", "filterpy")
+    kinds = ("against", "filterpy", "random_walk", "rated_power", "refusals")
     session.run(
         "python", "-m", "pytest", *(str(f) for kind in kinds for f in Path("tests/filters").glob(f"test_{kind}*"))
     )

@@ -687,29 +687,30 @@ class KFOPC(KalmanFilter, Checkpointed):
         F: ArrayLike | None = None,
         Q: ArrayLike | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return filterpy's `get_prediction`, refusing what `predict` refuses; nothing changes."""
-        u, B, F, Q = checked_steps.checked_prediction(self, u, B, F, Q)
-        x, P = super().get_prediction(u, B, F, Q)
-        if np.shape(x) != np.shape(self.x):
-            raise ValueError(f"x would become {np.shape(x)}, for u of shape {np.shape(u)}")
-        return x, P
+        """Return x and P as `predict` would leave them, or raise its error; nothing changes."""
+        before = self.__dict__.copy()  # predictions write into no array
+        try:
+            self.predict(u, B, F, Q)
+            return self.x, self.P
+        finally:
+            self._go_back(before)
 
     def get_update(self, z: ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return filterpy's `get_update` of the measurement scaled by the present factor; nothing changes."""
-        return super().get_update(None if z is None else self._presently_scaled(z))
+        return super().get_update(None if z is None else self._presently_scaled(z, self.dim_z))
 
     def residual_of(self, z: ArrayLike) -> np.ndarray:
         """Return the residual of the measurement scaled by the present factor; nothing changes."""
-        return super().residual_of(self._presently_scaled(z))
+        return super().residual_of(self._presently_scaled(z, self.dim_z))
 
     def log_likelihood_of(self, z: ArrayLike | None) -> float:
         """Return the log-likelihood of the measurement scaled by the present factor; nothing changes."""
-        if z is not None and np.size(z) != len(self.S):
-            raise ValueError(f"z must have {len(self.S)} value(s), as in the last update, got shape {np.shape(z)}")
-        return super().log_likelihood_of(None if z is None else self._presently_scaled(z))
+        return super().log_likelihood_of(None if z is None else self._presently_scaled(z, len(self.S)))
 
-    def _presently_scaled(self, z: Any) -> Any:
+    def _presently_scaled(self, z: Any, size: int) -> Any:
         checked_steps.require_unmasked(z)
+        if np.size(z) != size:
+            raise ValueError(f"z must have {size} value(s), got shape {np.shape(z)}")
         return self._scaled(z, self.constraint_factor)
 
     @staticmethod

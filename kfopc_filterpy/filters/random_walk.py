@@ -105,7 +105,8 @@ class RandomWalkKFOPC(KFOPC):
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
         super().__init__(n_taps, 1, rated_power=rated_power, constraint=constraint)
-        self.state_noise, self.measurement_noise = state_noise, measurement_noise
+        self.Q = as_nonnegative(state_noise, "state_noise")
+        self.R = as_nonnegative(measurement_noise, "measurement_noise")
         variance = as_nonnegative(initial_variance, "initial_variance")
         # P = scale T + diagonal I, of which T is a symmetric matrix with only its lower triangle
         self._triangle, self._scale, self._diagonal = variance * np.eye(n_taps), 1.0, 0.0
@@ -114,24 +115,6 @@ class RandomWalkKFOPC(KFOPC):
         self._predicted = False  # P is P_prior
         self._gain, self._last = np.zeros(n_taps), (0.0, 0.0, 0.0)  # K of the last update; its z, y and S
         del self.__dict__["P"]
-
-    @property
-    def state_noise(self) -> float | None:
-        """State noise variance r of eq. 4; None if a full `Q` was assigned."""
-        return self._Q
-
-    @state_noise.setter
-    def state_noise(self, value: float) -> None:
-        self.Q = as_nonnegative(value, "state_noise")
-
-    @property
-    def measurement_noise(self) -> float:
-        """Measurement noise variance q of eq. 7."""
-        return self._R
-
-    @measurement_noise.setter
-    def measurement_noise(self, value: float) -> None:
-        self.R = as_nonnegative(value, "measurement_noise")
 
     # The steps.
 
@@ -204,7 +187,7 @@ class RandomWalkKFOPC(KFOPC):
         if not float_info.min <= S < inf:
             if noise == 0.0 and not h.any():
                 raise ValueError(checked_steps.SILENT_REFERENCE)
-            cause = "it overflows" if S > 1.0 else "P is not positive definite on H, or 1/S overflows"
+            cause = "P is not positive definite on H, or 1/S overflows" if S < 1.0 else "it overflows"
             raise ValueError(f"S = H P H' + R must be positive, got {S:g}: {cause}. Nothing was changed")
         y = factor * d - ddot(h, x)  # eq. 9
         K = u / S  # eq. 6

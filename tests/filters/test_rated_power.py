@@ -192,7 +192,7 @@ def test_a_tracker_is_refused_before_anything_changes() -> None:
     """Its measurement would be scaled: the estimate of a target at 19.8 m, moving at 2 m/s, would be 1.7 m."""
     kf = KFOPC(2, 1, rated_power=1.0)
     kf.F, kf.H = [[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.0]]
-    kf.secondary_path_gain = 1.0
+    kf.secondary_path_gain, kf.M = 1.0, np.zeros((2, 1))
     x, P = kf.x, kf.P
     for step in (kf.predict, kf.predict_steadystate, lambda: kf.update(19.8), lambda: kf.update_correlated(19.8)):
         with pytest.raises(

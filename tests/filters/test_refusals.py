@@ -186,8 +186,6 @@ def faults_of_random_walk_assignments() -> dict[str, Fault]:
         "R": {"negative": -1.0, "[[Inf]]": [[INF]], "of another size": np.eye(2)},
         "P": {"NaN": NAN * np.eye(TAPS), "of another size": np.eye(2)},
         "x": {"NaN": np.full(TAPS, NAN), "of another size": np.ones((2, 1))},
-        "state_noise": {"negative": -1.0, "two": [1.0, 2.0], "None": None},
-        "measurement_noise": {"negative": -1.0, "text": "quiet"},
     }
     for name in "FQRPx":
         array = np.ones((1, 1)) if name == "R" else np.eye(TAPS, 1 if name == "x" else TAPS)
@@ -351,6 +349,13 @@ def test_a_general_filter_without_a_rated_power_goes_on_from_a_shallow_copy() ->
 
 
 # Arguments of other kinds.
+
+
+@pytest.mark.parametrize("name", ["state_noise", "measurement_noise", "initial_variance"])
+def test_variances_are_numbers_of_at_least_zero(name: str) -> None:
+    for bad in (-1.0, [1.0, 2.0], None, "quiet", NAN):
+        with pytest.raises((ValueError, TypeError), match=name):
+            KFOPC.random_walk(4, **{"state_noise": 1.0, "measurement_noise": 1.0} | {name: bad})
 
 
 def test_F_and_H_may_be_nested_lists() -> None:
