@@ -17,6 +17,7 @@ from kfopc_filterpy.controllers.table import CORE, MAKERS
 from kfopc_filterpy.power.amplifiers import Amplifier
 from kfopc_filterpy.verdict.candidates import DIAGONAL_STATE_NOISES, FORGOTTEN, STEP_SIZES
 
+from ..rivals import PowerLimitedFxLMS
 from .scene import Scene
 
 # r E[x'^2] / q: the filter forgets over about its inverse square root in samples, 0.6 s to 6 ms at 16 kHz. Less state
@@ -173,8 +174,8 @@ def _in_blocks(scene: Scene, mu: float, _: float) -> dict[str, Any]:
 
 
 def _within_power(scene: Scene, mu: float, _: float) -> dict[str, Any]:
-    limits = {"band_edges": (0.0, scene.fs / 2), "band_powers": [scene.rated_power], "fs": scene.fs}
-    return _in_blocks(scene, mu, np.nan) | limits
+    """Return four blocks for the control filter, as for all that adapt once per block."""
+    return {"step_size": mu, "block_size": max(-(-scene.n_taps // 4), 16), "rated_power": scene.rated_power}
 
 
 def _constrained(settings: Settings) -> Settings:
@@ -244,7 +245,7 @@ REGISTRY: dict[str, Algorithm] = {
     "re-scaling FxLMS": _made_by("re-scaling FxLMS", _peak, **_PEAK, **_CHANNELS),
     "clipping FxLMS": _made_by("clipping FxLMS", _peak, **_PEAK, **_CHANNELS),
     "frequency-domain FxLMS": _made_by("frequency-domain FxLMS", _in_blocks, **_BLOCKS, **_FREE),
-    "power-limited FxLMS": _made_by("band-limited FxLMS", _within_power, **_BLOCKS),
+    "power-limited FxLMS": Algorithm(PowerLimitedFxLMS, _within_power, in_core=False, **_BLOCKS),
 }
 
 

@@ -1,4 +1,4 @@
-"""The entries: the algorithms of this package, and adaptive filters of other packages, used as installed.
+"""The entries: the algorithms of this package, the rivals, and adaptive filters of other packages, used as installed.
 
 Filters of other packages are made for system identification or for filtered-x LMS. Each is put into the structure that
 its interface requires, has its own grid of settings, and is tuned by the rule for all.
@@ -14,20 +14,23 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy.bounds import wiener_solution
-from kfopc_filterpy.controllers import SubfilterKalman, band_subfilters
-from kfopc_filterpy.controllers.channel_samples import ChannelFilters
 
 from ..bench import Algorithm, algorithms
+from ..rivals import FastArrayKalman, FrequencyDomainKalman, SubbandFxLMS, SubfilterKalman
+from ..rivals.one_channel import OneChannel
+from ..rivals.subfilters import band_subfilters
 from .blocks import PlaysBlocks
 from .tasks import Task
 
 STEPS = (1.0, 0.25, 1 / 16, 1 / 64)  # fewer than for our own: a sample takes more than a hundred times as long
 FORGOTTEN = (1e-5, 1e-4, 1e-3)
 STATE_NOISES = (1e-7, 1e-6, 1e-5)
+TRANSITIONS = (1e-5, 1e-4, 1e-3, 1e-2)
+BANDS, BAND_STEPS = 32, (1e-3, 3e-3, 1e-2, 3e-2)  # of the subband FxLMS: fewer bands alias, larger steps diverge
 DESIGN_S, DESIGN_RIDGE = 4.0, 1e-4  # of the white noise by which sub-filters are designed
 
 
-class FilteredX:
+class FilteredX(OneChannel):
     """A filter for system identification in the modified filtered-x structure: it identifies d^ = e + s^ * y from x'.
 
     Parameters
@@ -47,23 +50,18 @@ class FilteredX:
         adapt: Callable[[np.ndarray, float], Any],
         weights: Callable[[], np.ndarray],
     ) -> None:
+        super().__init__(n_taps, secondary_path)
         self._adapt, self._weights = adapt, weights
-        self._path, self._played = (ChannelFilters(secondary_path[np.newaxis, np.newaxis]) for _ in range(2))
-        self._x, self._filtered = np.zeros((2, n_taps))
 
     def control_signal(self, reference: float) -> float:
         """Return the control signal for the newest reference sample."""
-        self._path.push(np.array([reference]))
-        for line, newest in ((self._x, reference), (self._filtered, self._path.output()[0])):
-            line[1:] = line[:-1]
-            line[0] = newest
-        y = float(self._weights() @ self._x)
-        self._played.push(np.array([y]))
-        return y
+        self.hear(reference)
+        self.w = np.asarray(self._weights())
+        return self.play()
 
     def update(self, error: float) -> None:
         """Let the filter adapt to the disturbance that the error reveals."""
-        self._adapt(self._filtered, float(error + self._played.output()[0]))
+        self._adapt(self.filtered[: self.w.size], self.disturbance(error))
 
 
 # ---- Filters of other packages
@@ -174,17 +172,39 @@ def _subfilters(task: Any, ratio: float, _: float) -> dict[str, Any]:
     }
 
 
-def _subfilter_kalman(n_taps: int, path: np.ndarray, *, subfilters: np.ndarray, **settings: Any) -> SubfilterKalman:
-    return SubfilterKalman(subfilters, path, **settings)
+def _fast_array(task: Any, forgotten: float, _: float) -> dict[str, Any]:
+    return {"forgetting": 1.0 - forgotten, "initial_variance": task.initial_variance / task.measurement_noise}
+
+
+def _frequency_kalman(task: Any, lost: float, _: float) -> dict[str, Any]:
+    """Return four blocks for the control filter, as for all that adapt once per block."""
+    return {
+        "block_size": max(-(-task.n_taps // 4), 16),
+        "transition": 1.0 - lost,
+        "initial_variance": task.n_taps * task.initial_variance,  # of a bin
+    }
+
+
+def _subbands(task: Any, mu: float, _: float) -> dict[str, Any]:
+    return {"step_size": mu, "n_bands": BANDS}
 
 
 def _with_task(settings: Any) -> Any:
     return lambda task, first, second: settings(task, first, second) | {"task": task}
 
 
-def own_entries() -> dict[str, Algorithm]:
-    """Return the entries of this package that are not in its registry."""
-    return {"sub-filter KF": Algorithm(_subfilter_kalman, _subfilters, "ratio", "r E[d^2]/q", STATE_NOISES)}
+def rivals() -> dict[str, Algorithm]:
+    """Return the entries of `comparisons.rivals` that are not in the registry."""
+    return {
+        "fast-array KF": Algorithm(
+            FastArrayKalman, _fast_array, "1 - lambda", "1 - lambda", (0.0, *FORGOTTEN), keeps_budget=False
+        ),
+        "subband FxLMS": Algorithm(SubbandFxLMS, _subbands, "mu of a band", "mu", BAND_STEPS, keeps_budget=False),
+        "frequency-domain KF": Algorithm(
+            FrequencyDomainKalman, _frequency_kalman, "1 - A", "1 - A", TRANSITIONS, keeps_budget=False
+        ),
+        "sub-filter KF": Algorithm(SubfilterKalman, _subfilters, "ratio", "r E[d^2]/q", STATE_NOISES),
+    }
 
 
 def peers() -> dict[str, Algorithm]:

@@ -22,7 +22,7 @@ from ..bench import Algorithm, AllDivergedError, Runs, make_controller, run_sett
 from ..bench.registry import registered
 from ..bench.tuning import BUDGET
 from .blocks import CommandController, EntryFailed
-from .entries import entries_for, own_entries, peers
+from .entries import entries_for, peers, rivals
 from .tasks import FOLDER, JUDGED, LeftOut, Task, read_task
 
 SHARE = 0.9  # of the steady noise reduction, that is reached after a time
@@ -199,7 +199,7 @@ def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = Non
         prepare_folder(options.output)
     except OSError as error:
         parser.error(str(error))
-    entries: dict[str, Entry] = {**own_entries(), **peers(), **(objects or {}), **commands}
+    entries: dict[str, Entry] = {**rivals(), **peers(), **(objects or {}), **commands}
     runs, outcomes = Runs(), []
     with one_blas_thread(), warnings.catch_warnings():  # as in the runs that are timed
         warnings.simplefilter("ignore", RuntimeWarning)  # of filters that diverge while they are tuned

@@ -18,7 +18,7 @@ from comparisons.bench import Algorithm, Runs, algorithms, make_controller
 from comparisons.bench.registry import registered
 from comparisons.benchmark import study, tasks
 from comparisons.benchmark.blocks import CommandController, EntryFailed
-from comparisons.benchmark.entries import own_entries, peers
+from comparisons.benchmark.entries import peers, rivals
 from comparisons.benchmark.tasks import FOLDER, LeftOut, Task, read_task
 from kfopc_filterpy import FxNLMS
 
@@ -152,10 +152,10 @@ def test_every_entry_has_a_score_or_a_reason(short: Task, tmp_path: Path) -> Non
             raise RuntimeError("out of order")
 
     broken = Algorithm(Broken, lambda task, mu, _: {}, "mu", "mu", (0.1,))
-    entries = {**own_entries(), "broken": broken, "command": "no-such-program"}
+    entries = {**rivals(), "broken": broken, "command": "no-such-program"}
     outcome = study.run_task(Runs(), short, entries, only="[FKsbc]*")
     scores = {one.entry: one for one in outcome["scores"]}
-    assert set(scores) == {*entries, *(name for name in algorithms() if name[0] in "FKsbc")}
+    assert set(scores) == {name for name in (*entries, *algorithms()) if name[0] in "FKsbc"}
     failed = {name: one.failed for name, one in scores.items() if one.failed}
     assert failed == {
         "broken": "RuntimeError: out of order",
