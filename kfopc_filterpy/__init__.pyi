@@ -33,11 +33,9 @@ from . import (
 )
 from .bounds.power_constrained import power_constrained_wiener as power_constrained_wiener
 from .bounds.settings import suggest_settings as suggest_settings
-from .controllers.band_limited import BandLimitedFxLMS as BandLimitedFxLMS
 from .controllers.clipping import ClippingFxLMS as ClippingFxLMS
 from .controllers.diagonal import DiagonalKalman as DiagonalKalman
 from .controllers.frequency_domain import FrequencyDomainFxLMS as FrequencyDomainFxLMS
-from .controllers.frequency_kalman import FrequencyDomainKalman as FrequencyDomainKalman
 from .controllers.fxlms import FxLMS as FxLMS
 from .controllers.fxnlms import FxNLMS as FxNLMS
 from .controllers.fxrls import fx_rls as fx_rls
@@ -50,7 +48,6 @@ from .controllers.limited import LimitedController as LimitedController
 from .controllers.mov import MOVFxLMS as MOVFxLMS
 from .controllers.power_budget import kf_pb as kf_pb
 from .controllers.rescaling import RescalingFxLMS as RescalingFxLMS
-from .controllers.subband import SubbandFxLMS as SubbandFxLMS
 from .controllers.two_gradient import TwoGradientFxLMS as TwoGradientFxLMS
 from .filters.kfopc import KFOPC as KFOPC
 from .loop.result import SimulationResult as SimulationResult

@@ -7,7 +7,5 @@ from .leaky import leak_factor as leak_factor
 from .mov import penalty_factor as penalty_factor
 from .power_budget import PowerBudgetController as PowerBudgetController
 from .processing import RefusedUpdate as RefusedUpdate
-from .subfilter import SubfilterKalman as SubfilterKalman
-from .subfilter import band_subfilters as band_subfilters
 from .virtual import KalmanObserver as KalmanObserver
 from .virtual import VirtualMicrophones as VirtualMicrophones

@@ -1,20 +1,41 @@
-"""FxLMS in the frequency domain, by overlap-save."""
+"""FxLMS in the frequency domain, by overlap-save: the controller that adapts once per block, in numpy."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.fft import irfft, rfft
+from numpy.typing import ArrayLike
+from scipy.fft import irfft, next_fast_len, rfft
 
-from .._types import PathModels
-from .._validate import as_choice, as_positive
-from .base import as_forgetting
-from .block import BlockController
+from .._types import NumberOrArray, PathModels
+from .._validate import as_choice, as_count, as_positive
+from ..checkpoint import Checkpointed
+from ..core.block import LOUDEST, LOUDEST_LEARNT
+from .base import as_forgetting, calls_of, require_rates
+from .channel_samples import require_moderate
+from .channels import Channels
+from .processing import BlockProcessing, checked_block
 
 RIDGE = 0.01  # of the mean power of all bins, added to that of each: the noise may leave bins empty
+SPREAD = 0.5  # a tenth is too little for tones in the middle of a bin; the edges of a band converge slower with more
+QUIET = 1e-3  # of the usual power: below it, the weights would follow the noise of the microphones
+HELD = (
+    1000.0  # filter lengths in which the usual power, that of which the weights were learned, changes by a factor of e
+)
+RISE, YOUNG = 4.0, 2.0  # for the first YOUNG of them it may rise by e^RISE in each: a bad sample is not usual
+UNHEARD = 100.0  # times the usual amplitude: a past that is so soft teaches little but the noise of the microphones
+MOST_WEIGHT = 1e80  # a step that leads beyond it is left out; the error of such weights is below LOUDEST: they adapt on
+ROUNDING = 1e-12  # -120 dB; rounding errors are at -300 dB
+TINY = float(np.finfo(float).tiny)
 
 
-class FrequencyDomainFxLMS(BlockController):
+class FrequencyDomainFxLMS(Channels, BlockProcessing, Checkpointed):
     r"""FxLMS that adapts once per block of B samples, by Fourier transforms: cheap with many taps.
+
+    The control filter is kept as spectra of P partitions with N taps each, and blocks are filtered by overlap-save with
+    transforms of N + B samples. The control signal has no delay: what the samples before the block contribute to it is
+    computed when the block begins, and what the block's own samples contribute takes B multiplications per sample,
+
+    .. math:: y(n_0 + i) = \sum_{l=0}^{i} w_l\, x(n_0 + i - l) + \sum_{l>i} w_l\, x(n_0 + i - l)
 
     With :math:`X'_p` the spectrum of the filtered reference that partition p of the control filter sees, and E that of
     the block's errors after zeros,
@@ -23,15 +44,26 @@ class FrequencyDomainFxLMS(BlockController):
 
        W_p \leftarrow W_p + \mu\, C\big\{M\, C\{M^* X_p'^* E\}\big\},
 
-       |M|^2 = \frac{1}{\Lambda},
-
-       \Lambda = \sum_p |X'_p|^2
+       |M|^2 = \frac{1}{\Lambda}
 
     C is the gradient constraint: in the time domain, the taps beyond the partition are set to zero. M is causal, the
     minimum-phase factor of the step. With it, all bins converge at about the same rate, whatever the colour of the
     noise, and the weights settle at the best causal filter; a step :math:`1/\Lambda` applied at once would also weight
     what no causal filter can cancel. Without M this is exactly the block LMS, :math:`w \leftarrow w + \mu \sum_n e(n)\,
     x'(n)`.
+
+    :math:`\Lambda` is the power of the filtered reference as the N taps of a partition see it. Their spectra are
+    coarser than the transform's: a tone in the middle of a bin has no power in the next one, but a filter that cancels
+    it has. So the mean power :math:`\overline{|X'|^2}` of a bin is spread over the others,
+
+    .. math::
+
+       \Lambda_k = P g \Big(\frac{11}{12}\, \overline{|X'_k|^2} +
+       \sum_{j \ne 0} \frac{\overline{|X'_{k-j}|^2}}{4 \pi^2 j^2} + \text{ridge}\Big)
+
+    The factor g is 1 in steady noise. It
+    raises a mean that lags behind: to the power that the newest references will have behind the secondary path, and in
+    a quiet passage to a thousandth of the usual power.
 
     Parameters
     ----------
@@ -50,7 +82,7 @@ class FrequencyDomainFxLMS(BlockController):
         them out) and vary within a block, so the secondary path must be much shorter than a block, and the weights
         settle only near the best filter.
     forgetting : float or None, default 0.9
-        Forgetting factor, per block, of the powers :math:`\Lambda`. None gives the block LMS, without M.
+        Forgetting factor, per block, of the mean powers. None gives the block LMS, without M.
 
     Attributes
     ----------
@@ -66,10 +98,13 @@ class FrequencyDomainFxLMS(BlockController):
 
     Notes
     -----
-    The control signal has no delay: what earlier samples contribute to it is computed when a block begins, and the
-    block's own samples take B multiplications each. A block takes some ``4 P`` transforms of ``N + B`` samples with the
-    constraint, and a fixed number without. If the secondary path is longer than a block, the step size must be smaller.
-    For a limiter, wrap it in a `LimitedController`. References above 1e20 and errors above 1e100 are refused.
+    A block takes some ``4 P`` transforms of ``N + B`` samples with the constraint, and a fixed number without. If the
+    secondary path is longer than a block, the step size must be smaller. For a limiter, wrap it in a
+    `LimitedController`. References above 1e20 and errors above 1e100 are refused.
+
+    A reference sample that is more than 40 dB above the usual level sets the weights to zero, unless `forgetting` is
+    None: the noise has just begun. What was learned in the near silence before it was the noise of the microphones, and
+    the control signal would now be louder than this noise by as much.
 
     References
     ----------
@@ -108,59 +143,276 @@ class FrequencyDomainFxLMS(BlockController):
         self.step_size = as_positive(step_size, "step_size")
         self.forgetting = None if forgetting is None else as_forgetting(forgetting)
         self.constrained = as_choice(constrained, "constrained", (True, False))
-        super().__init__(
-            n_taps,
-            secondary_path,
-            block_size=block_size,
-            partition_size=partition_size,
-            n_references=n_references,
-        )
-        if not self.constrained and self.n_taps % self.partition_size:
+        self.n_taps = as_count(n_taps, "n_taps")
+        path = self._read_paths(secondary_path, n_references, None)
+        B = self.block_size = as_count(block_size, "block_size")
+        N = self.partition_size = B if partition_size is None else as_count(partition_size, "partition_size")
+        if N % B:
             raise ValueError(
-                f"n_taps must be a multiple of partition_size = {self.partition_size} without the constraint, "
-                f"got {self.n_taps}"
+                f"partition_size must be a multiple of block_size = {B}, got {N}: spectra of earlier blocks are used again"
             )
-        self._powers, self._blocks = np.zeros(self._W.shape[-1]), 0  # of a partition's filtered references
+        if not self.constrained and self.n_taps % N:
+            raise ValueError(
+                f"n_taps must be a multiple of partition_size = {N} without the constraint, got {self.n_taps}"
+            )
+        K, J, I = self.n_microphones, self.n_loudspeakers, self.n_references  # noqa: E741
+        P = self.n_partitions = -(-self.n_taps // N)
+        self._every = N // B  # blocks between the spectra of neighbouring partitions
+        self._size = N + B  # of the transforms
+        spectra, bins = (P - 1) * self._every + 1, self._size // 2 + 1
+        self._take_path(path)
+        self._references = np.zeros((I, (P - 1) * N + self._window))  # forward in time, up to the end of the last block
+        self._now = np.zeros((I, 2 * B - 1))  # the references of this block, after zeros
+        self._errors, self._taken = np.zeros((K, B)), np.zeros(B, dtype=bool)  # of this block, and which were taken
+        self._n = 0  # samples of this block
+        # Spectra, the newest block first.
+        self._X = np.zeros((I, spectra, bins), dtype=complex)
+        self._X_filtered = np.zeros((K, J, I, spectra, bins), dtype=complex)
+        self._W = np.zeros((J, I, P, bins), dtype=complex)
+        self._earlier = np.zeros((J, B))  # what the samples before this block contribute to its control signals
+        self._first_taps = np.zeros((J, I, B))  # the last of them first
+        # Mean squares: of a partition's filtered references by bins; of the references, those of usual blocks.
+        self._powers, self._usual, self._blocks = np.zeros(bins), np.zeros(I), 0
+        self._age = 0  # blocks since the weights began
+
+    # The secondary path.
+
+    def _take_path(self, path: np.ndarray) -> None:
+        self._path = path
+        self._window = next_fast_len(self._size + path.shape[-1] - 1, real=True)
+        paths = path.reshape(self.n_microphones, self.n_loudspeakers, 1, -1)
+        self._S = rfft(paths, self._window)
+        # The gain in each bin, summed over all paths: bins are samples of a spectrum, so a longer path is folded.
+        folded = np.pad(paths, [(0, 0)] * 3 + [(0, -path.shape[-1] % self._size)])
+        folded = folded.reshape(*folded.shape[:3], -1, self._size).sum(axis=3)
+        self._path_gain = np.sum(np.abs(rfft(folded)) ** 2, axis=(0, 1, 2))
+
+    @property
+    def secondary_path(self) -> np.ndarray:
+        """Estimated secondary path s^, (n_path,), or with several channels (K, J, n_path); a copy.
+
+        A new estimate can be assigned between two samples: taps or an FIR system, with several channels as many paths
+        as before, and no longer than the present estimate. The stored references are filtered again with it; the
+        weights stay.
+        """
+        return self._path.copy()
+
+    @secondary_path.setter
+    def secondary_path(self, path: PathModels) -> None:
+        self._take_path(self._checked_estimate(path, self._path.shape))
+        for back in range(self._X_filtered.shape[-2]):
+            self._X_filtered[..., back, :] = self._filtered_spectrum(back)
+
+    def _filtered_spectrum(self, back: int = 0) -> np.ndarray:
+        """Return the spectrum of the filtered references at the end of the block `back` blocks ago, (K, J, I, bins)."""
+        end = self._references.shape[1] - back * self.block_size
+        x = rfft(self._references[:, end - self._window : end])
+        return rfft(self._newest(irfft(x * self._S, self._window)))
+
+    def _newest(self, signal: np.ndarray) -> np.ndarray:
+        """Return the newest N + B samples."""
+        return signal[..., -self._size :]
+
+    # The control filter.
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Control filter w, (L,), or with several channels (J, I, L), newest-sample tap first; a copy."""
+        w = self._partitions(self._W).reshape(self.n_loudspeakers, self.n_references, -1)[..., : self.n_taps]
+        return w if self.multichannel else w[0, 0]
+
+    def _partitions(self, spectra: np.ndarray) -> np.ndarray:
+        """Return the taps of partitions, (..., N); the taps beyond N of their transforms are left out."""
+        return irfft(spectra, self._size)[..., : self.partition_size]
+
+    def _begin_block(self) -> None:
+        """Compute what a block needs; its own samples are zero as yet."""
+        heard = np.pad(self._references[:, -self.partition_size :], [(0, 0), (0, self.block_size)])
+        X = np.concatenate((rfft(heard)[:, None], self._X[:, self._every - 1 :: self._every]), axis=1)
+        filtered = irfft(np.sum(self._W * X[:, : self.n_partitions], axis=(1, 2)), self._size)
+        self._earlier = filtered[:, self.partition_size :]  # what overlap-save keeps
+        self._first_taps = np.ascontiguousarray(self._partitions(self._W[:, :, 0])[..., self.block_size - 1 :: -1])
+
+    def _end_block(self) -> None:
+        self._references = np.concatenate(
+            (self._references[:, self.block_size :], self._now[:, self.block_size - 1 :]), axis=1
+        )
+        for spectra, newest in (
+            (self._X, rfft(self._newest(self._references))),
+            (self._X_filtered, self._filtered_spectrum()),
+        ):
+            spectra[..., 1:, :] = spectra[..., :-1, :]
+            spectra[..., 0, :] = newest
+        self._follow()
+        if self._taken.any():
+            self._adapt()
+        self._errors[:], self._taken[:], self._n = 0.0, False, 0
+        self._begin_block()
+
+    # The step.
 
     def _follow(self) -> None:
+        """Follow the powers of a block, also if no error was taken."""
         self._blocks += 1
-        self._powers = self._averaged(self._powers, np.sum(np.abs(self._X_filtered[..., 0, :]) ** 2, axis=(0, 1, 2)))
-
-    def _averaged(self, mean: np.ndarray, newest: np.ndarray) -> np.ndarray:
-        """Return a mean over blocks with the newest one."""
         share = max(1.0 - (self.forgetting or 0.0), 1.0 / self._blocks)
-        return mean + share * (newest - mean)
+        self._powers += share * (np.sum(np.abs(self._X_filtered[..., 0, :]) ** 2, axis=(0, 1, 2)) - self._powers)
+        heard, lengths = self._heard(), self.block_size / self.n_taps
+        self._age = self._age + 1 if self._W.any() else 0
+        rise = RISE * lengths if self._age * lengths < YOUNG else lengths / HELD
+        least, most = np.exp(-lengths / HELD) * self._usual, np.exp(rise) * self._usual
+        usual = np.where(self._usual > 0.0, np.clip(heard, least, most), heard)
+        self._usual = np.where(heard > 0.0, usual, self._usual)  # nothing is learned in silence
+
+    def _heard(self) -> np.ndarray:
+        """Return the mean squares of the newest references, (I,)."""
+        return np.asarray(np.mean(self._newest(self._references) ** 2, axis=1))
+
+    def _divisor(self) -> np.ndarray:
+        """Return Lambda, (bins,)."""
+        # A mean lags behind. The newest references will have this power behind the path, whose delay they still have ahead.
+        soon = self._path_gain * np.sum(np.abs(self._X[:, 0]) ** 2, axis=0)
+        powers = np.maximum(self._powers, 0.5 * soon)
+        # In the time domain, spreading powers over the bins by SPREAD / (2 pi^2 j^2) is a window of their correlation.
+        lags = np.arange(self._size) / self._size
+        spread = rfft(irfft(powers, self._size) * (1.0 - SPREAD * lags * (1.0 - lags))).real
+        heard, mean = self._heard().sum(), float(np.mean(powers))
+        least = QUIET * self._usual.sum() / heard * float(np.mean(soon)) if heard > 0.0 else 0.0
+        raised = max(least / mean, 1.0) if mean > 0.0 else 1.0
+        # Far below the power of the filtered references, but above that of their rounding errors.
+        rounding = ROUNDING * self._size * float(np.sum(self._path**2)) * heard / self.n_references + TINY
+        return self.n_partitions * (raised * (spread + RIDGE * mean) + rounding)
 
     def _adapt(self) -> None:
-        self._descend(self._gradient(), self._divisor(self._powers))
-
-    def _divisor(self, powers: np.ndarray) -> np.ndarray:
-        """Return Lambda by the powers that a partition sees in each bin, (..., bins)."""
-        least = self._size * self._least_power()
-        return self.n_partitions * (powers + RIDGE * np.mean(powers, axis=-1, keepdims=True) + least)
-
-    def _gradient(self) -> np.ndarray:
-        """Return X'* E, summed over microphones, (J, I, P, bins): minus half the gradient of the squared errors."""
-        E = self._block_spectrum(self._errors)[:, None, None, None]
-        return np.sum(self._X_filtered[..., :: self._every, :].conj() * E, axis=0)
-
-    def _descend(self, gradient: np.ndarray, divisor: np.ndarray) -> None:
-        """Take a step along a gradient (J, I, P, bins), divided in each bin."""
+        """Take a step, after a block in which at least one error was taken."""
+        E = rfft(np.pad(self._errors, [(0, 0), (self.partition_size, 0)]))[:, None, None, None]
+        # X'* E, summed over microphones, (J, I, P, bins): minus half the gradient of the squared errors.
+        step = np.sum(self._X_filtered[..., :: self._every, :].conj() * E, axis=0)
         if self.forgetting is not None:
-            factor = minimum_phase(divisor**-0.5, self._size)
-            gradient *= factor.conj()
-            self._constrain(gradient)
-            gradient *= factor
-        self._constrain(gradient)
-        self._W = self._W + self.step_size * gradient
+            factor = minimum_phase(self._divisor() ** -0.5, self._size)
+            step *= factor.conj()
+            self._constrain(step)
+            step *= factor
+        self._constrain(step)
+        W = self._W + self.step_size * step
+        if np.abs(W.view(float)).max() <= MOST_WEIGHT:  # NaN is not
+            self._W = W
 
-    def _constrain(self, gradient: np.ndarray) -> None:
+    def _constrain(self, step: np.ndarray) -> None:
         """Set the taps beyond the partitions to zero."""
-        chosen = gradient if self.constrained else gradient[:, :, :1]
+        chosen = step if self.constrained else step[:, :, :1]
         taps = self._partitions(chosen)
         if self.constrained:
             taps[:, :, -1, self.n_taps - (self.n_partitions - 1) * self.partition_size :] = 0.0
-        chosen[:] = self._spectra(taps)
+        chosen[:] = rfft(taps, self._size)
+
+    # Samples.
+
+    @property
+    def samples_left(self) -> int:
+        """Samples until the present block ends, or the next one if it has just ended."""
+        return self.block_size - self._n % self.block_size
+
+    def emit(self, x: np.ndarray, limit: np.ndarray | None = None) -> np.ndarray:
+        """Return the control signals (J, n) for references x (I, n) of at most `samples_left` samples.
+
+        They end before a sample at which the weights begin anew, and before the first one that is not within a `limit`
+        (J, 1), but have at least one sample.
+        """
+        require_moderate(x, "reference")
+        if self._n == self.block_size:  # the error of its last sample was not taken
+            self._end_block()
+        unheard = np.any(np.abs(x) > UNHEARD * np.sqrt(self._usual)[:, None], axis=0)
+        if unheard.any() and self.forgetting is not None and self._W.any():
+            if unheard[0]:
+                self._W[:] = 0.0
+                self._begin_block()
+            else:
+                x = x[:, : np.argmax(unheard)]
+        begin, end = self._n, self._n + x.shape[1]
+        self._now[:, self.block_size - 1 + begin : self.block_size - 1 + end] = x
+        y = self._earlier[:, begin:end].copy()
+        for j, filters in enumerate(self._first_taps):
+            for i, taps in enumerate(filters):
+                y[j] += np.correlate(self._now[i, begin : end + self.block_size - 1], taps, "valid")
+        if limit is not None:
+            within = np.all(np.abs(y) <= limit, axis=0)
+            end = end if within.all() else begin + max(int(np.argmin(within)), 1)
+            y = y[:, : end - begin]
+        self._n = end
+        return y
+
+    def take(self, errors: np.ndarray, taken: ArrayLike = True) -> None:
+        """Take the errors (K, n) that the last n control signals left; `taken`, (n,), says which of them to adapt to."""
+        require_moderate(errors, "error", LOUDEST)
+        here = slice(self._n - errors.shape[1], self._n)
+        self._taken[here] = taken
+        self._errors[:, here] = np.where(self._taken[here], errors, 0.0)
+        if self._n == self.block_size and self._taken[-1]:
+            self._end_block()
+
+    def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
+        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last block.
+
+        With several channels, x(n) is (I,) and y(n) is (J,).
+        """
+        x = self._sample(reference, "reference", "references")
+        y = self.emit(np.reshape(x, (-1, 1)))[:, 0]
+        return y if self.multichannel else float(y[0])
+
+    def update(self, error: NumberOrArray) -> None:
+        """Take the error e(n), with several channels (K,), that the last control signal left; adapt after B samples."""
+        e = self._sample(error, "error", "microphones")
+        if self._n == 0:
+            raise ValueError("update must follow the control_signal of its sample, but a new block has just begun")
+        self.take(np.reshape(e, (-1, 1)))
+
+    def process(
+        self,
+        references: ArrayLike | None,
+        errors: ArrayLike,
+        *,
+        adapt: bool | ArrayLike = True,
+        out: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return the control signals for a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
+        x, e, flags, y = checked_block(self, references, errors, adapt, out)
+        loud = np.abs(x).max() > LOUDEST_LEARNT or np.abs(e).max() > LOUDEST
+        if loud or not runs_in_blocks(self):
+            return super().process(x, e, adapt=flags, out=y)  # up to the sample that is refused
+        begin, (x_rows, e_rows, y_rows) = 0, (np.atleast_2d(signal) for signal in (x, e, y))
+        while begin < flags.size:
+            part = self.emit(x_rows[:, begin : begin + self.samples_left])
+            end = begin + part.shape[1]
+            y_rows[:, begin:end] = part
+            self.take(e_rows[:, begin:end], flags[begin:end])
+            begin = end
+        return y
+
+    def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
+        """Follow the noise before the control is switched on, while the loudspeakers are silent; the weights stay.
+
+        Parameters
+        ----------
+        references : ndarray, shape (n_samples,) or (I, n_samples)
+            References.
+        errors : ndarray, shape (n_samples,) or (K, n_samples)
+            Signals of the error microphones.
+        """
+        self.process(references, errors, adapt=False)
+
+    def require_sample_rate(self, fs: float) -> None:
+        """Raise ValueError if the secondary path is for another sample rate than `fs` in Hz."""
+        require_rates(fs, {"secondary path": self._path_fs})
+
+    def __repr__(self) -> str:
+        parts = f"{self.n_partitions} partition{'s' if self.n_partitions > 1 else ''} of {self.partition_size}"
+        return f"<{self.name}: {self.n_taps} taps in {parts}, blocks of {self.block_size} samples>"
+
+
+def runs_in_blocks(controller: object) -> bool:
+    """Return whether a controller keeps its control filter for a block, and no subclass changes what a sample does."""
+    kind = type(controller)
+    return isinstance(controller, FrequencyDomainFxLMS) and calls_of(kind) == calls_of(FrequencyDomainFxLMS)
 
 
 def minimum_phase(magnitude: np.ndarray, size: int) -> np.ndarray:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from .band_limited import BandLimitedFxLMS
 from .clipping import ClippingFxLMS
 from .diagonal import DiagonalKalman
 from .frequency_domain import FrequencyDomainFxLMS
@@ -39,5 +38,4 @@ CORE: dict[str, Callable[..., Any]] = {
 }
 MAKERS: dict[str, Callable[..., Any]] = CORE | {
     "frequency-domain FxLMS": FrequencyDomainFxLMS,
-    "band-limited FxLMS": BandLimitedFxLMS,
 }

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from .._types import ChangingPaths, PerLoudspeaker, Seed
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
 from ..controllers.base import Controller, Looped, checked_controller, differing_counts, listening
-from ..controllers.block import runs_in_blocks
 from ..controllers.channels import Channels
 from ..controllers.core_controller import NO_SOLUTION, CoreController
+from ..controllers.frequency_domain import runs_in_blocks
 from ..controllers.processing import takes_none
 from ..core.block import LOUDEST, LOUDEST_LEARNT
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals

@@ -29,11 +29,10 @@ from kfopc_filterpy import (
     kf_opc,
     kf_pb,
 )
-from kfopc_filterpy.controllers import SubfilterKalman, leak_factor, penalty_factor
+from kfopc_filterpy.controllers import leak_factor, penalty_factor
 
 L = 6
 PATH, PATHS = np.array([0.0, 0.8, -0.3]), random_paths(3, 2, 4, seed=1)
-BANK = np.ones((2, L))
 STEP, RATED = {"step_size": 0.1}, {"rated_power": 1.0}
 KALMAN = {"state_noise": 1e-5, "measurement_noise": 0.1, "initial_variance": 1.0}
 POWERS = {"disturbance_power": 1.0, "secondary_path_gain": 1.0}
@@ -100,12 +99,6 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: FxLMS(L, PATHS, limiter=[OutputLimiter(1.0)] * 2, **STEP), "2 different OutputLimiters"),
     (lambda: penalty_factor(1.0, **POWERS | {"disturbance_power": np.nan}), "disturbance_power"),
     (lambda: leak_factor(1.0, **POWERS, reference_power=-1.0), "reference_power"),
-    (lambda: SubfilterKalman(np.ones(4), PATH, **KALMAN), r"subfilters must be \(C, L\)"),
-    (lambda: SubfilterKalman(np.nan * BANK, PATH, **KALMAN), "subfilters must be finite"),
-    (lambda: SubfilterKalman(BANK, PATH, **KALMAN, rated_power=0.0), "rated_power must be"),
-    (lambda: SubfilterKalman(BANK, PATH, **KALMAN | {"state_noise": -1.0}), "state_noise must not be negative"),
-    (lambda: SubfilterKalman(BANK, PATH, **KALMAN | {"measurement_noise": 0.0}), "measurement_noise must be greater"),
-    (lambda: SubfilterKalman(BANK, PATH, **KALMAN, memory_s=0.0), "memory_s must be"),
 ]
 # fmt: on
 

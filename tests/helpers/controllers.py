@@ -12,11 +12,9 @@ from helpers.channels import random_paths
 from helpers.loop import AMPLIFIERS, FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R
 from kfopc_filterpy import (
     KFOPC,
-    BandLimitedFxLMS,
     ClippingFxLMS,
     DiagonalKalman,
     FrequencyDomainFxLMS,
-    FrequencyDomainKalman,
     FxLMS,
     FxNLMS,
     HardClipAmplifier,
@@ -28,7 +26,6 @@ from kfopc_filterpy import (
     OutputLimiter,
     OutputPowerConstraint,
     RescalingFxLMS,
-    SubbandFxLMS,
     TwoGradientFxLMS,
     fx_rls,
     kf_anc,
@@ -38,9 +35,7 @@ from kfopc_filterpy import (
 from kfopc_filterpy.controllers import (
     FeedbackNeutralizer,
     KalmanObserver,
-    SubfilterKalman,
     VirtualMicrophones,
-    band_subfilters,
     posterior,
 )
 from kfopc_filterpy.paths import PathTolerance
@@ -142,15 +137,6 @@ IN_BLOCKS: dict[str, Any] = {
     "frequency domain, many": lambda: FrequencyDomainFxLMS(
         L, PATHS, step_size=0.1, block_size=7, partition_size=14, **MANY
     ),
-    "band-limited": lambda: BandLimitedFxLMS(
-        24, S_HAT, step_size=0.2, block_size=7, band_edges=[0, FS / 4, FS / 2], band_powers=[0.1, 0.2], fs=FS
-    ),
-    "band-limited, many": lambda: BandLimitedFxLMS(
-        L, PATHS, step_size=0.1, block_size=7, band_edges=[0, FS / 2], band_powers=[[0.02], [0.05]], fs=FS, **MANY
-    ),
-    "subband": lambda: SubbandFxLMS(16, S_HAT, step_size=0.2, n_bands=4, block_size=14),
-    "subband, many": lambda: SubbandFxLMS(8, PATHS, step_size=0.1, n_bands=4, block_size=14, **MANY),
-    "frequency-domain Kalman": lambda: FrequencyDomainKalman(N_TAPS, S_HAT, block_size=7, partition_size=7),
 }
 
 # Controllers around something: around another controller, or a filter of somebody else.
@@ -242,13 +228,6 @@ AROUND: dict[str, Any] = {
     "FeedbackNeutralizer, a user's": lambda: FeedbackNeutralizer(OwnController(), [0.0, 0.1, 0.05]),
     "FeedbackNeutralizer, many": lambda: FeedbackNeutralizer(
         SEVERAL["kf_anc"](), random_paths(I, J, 3, seed=4), amplifier=HardClipAmplifier(0.7)
-    ),
-    "SubfilterKalman": lambda: SubfilterKalman(
-        band_subfilters(random_paths(1, 1, 12, seed=6)[0, 0], n_bands=3),
-        S_HAT,
-        state_noise=1e-6,
-        measurement_noise=1e-2,
-        rated_power=0.1,
     ),
     "VirtualMicrophones": lambda: VirtualMicrophones(
         FxLMS(L, PATHS[2:], step_size=MU, **MANY), PATHS, random_paths(1, 2, 3, seed=5), physical=[0, 1]
