@@ -33,25 +33,24 @@ from . import (
 )
 from .bounds.power_constrained import power_constrained_wiener as power_constrained_wiener
 from .bounds.settings import suggest_settings as suggest_settings
-from .controllers.clipping import ClippingFxLMS as ClippingFxLMS
-from .controllers.diagonal import DiagonalKalman as DiagonalKalman
-from .controllers.frequency_domain import FrequencyDomainFxLMS as FrequencyDomainFxLMS
-from .controllers.fxlms import FxLMS as FxLMS
-from .controllers.fxnlms import FxNLMS as FxNLMS
+from .controllers.clipping import clipping_fx_lms as clipping_fx_lms
+from .controllers.diagonal import diagonal_kf as diagonal_kf
+from .controllers.estimator import KalmanController as KalmanController
+from .controllers.frequency_domain import frequency_domain_fx_lms as frequency_domain_fx_lms
+from .controllers.fxlms import fx_lms as fx_lms
+from .controllers.fxnlms import fx_nlms as fx_nlms
 from .controllers.fxrls import fx_rls as fx_rls
-from .controllers.kalman import KalmanController as KalmanController
 from .controllers.kalman import kf_anc as kf_anc
 from .controllers.kalman import kf_opc as kf_opc
-from .controllers.leaky import LeakyFxLMS as LeakyFxLMS
-from .controllers.leaky import OptimalLeakyFxLMS as OptimalLeakyFxLMS
+from .controllers.kf_pb import kf_pb as kf_pb
+from .controllers.leaky import leaky_fx_lms as leaky_fx_lms
+from .controllers.leaky import optimal_leaky_fx_lms as optimal_leaky_fx_lms
 from .controllers.limited import LimitedController as LimitedController
-from .controllers.mov import MOVFxLMS as MOVFxLMS
-from .controllers.power_budget import kf_pb as kf_pb
-from .controllers.rescaling import RescalingFxLMS as RescalingFxLMS
-from .controllers.two_gradient import TwoGradientFxLMS as TwoGradientFxLMS
+from .controllers.mov import mov_fx_lms as mov_fx_lms
+from .controllers.rescaling import rescaling_fx_lms as rescaling_fx_lms
+from .controllers.two_gradient import two_gradient_fx_lms as two_gradient_fx_lms
 from .filters.kfopc import KFOPC as KFOPC
 from .loop.result import SimulationResult as SimulationResult
-from .loop.scenarios import simulate_scenarios as simulate_scenarios
 from .loop.simulation import simulate as simulate
 from .metrics import (
     clipped_fraction as clipped_fraction,
@@ -69,6 +68,7 @@ from .metrics import (
     output_power as output_power,
 )
 from .paths.models import bandpass_path as bandpass_path
+from .plant import Plant as Plant
 from .power.amplifiers import (
     HardClipAmplifier as HardClipAmplifier,
 )

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     import control
     import numpy as np
 
+    from .plant import Plant
+
 # A float with one channel, with several an array with a number for each, (n,). As with numpy's own functions that return
 # a number or an array, it is Any: with a union, a type checker would have every caller check which of them came.
 NumberOrArray: TypeAlias = Any
@@ -24,8 +26,8 @@ System: TypeAlias = "control.TransferFunction | control.StateSpace"
 PathModel: TypeAlias = "ArrayLike | System"
 # One path, or several: taps (outputs, inputs, n_taps), a system with several channels, or rows of systems.
 PathModels: TypeAlias = "PathModel | Sequence[Sequence[System]]"
-# What stays, or pairs of a time in s and what holds from it on; see `simulate`.
-ChangingPaths: TypeAlias = "PathModels | Sequence[tuple[float, PathModels]]"
+# What a controller takes as the estimate of the secondary path: also that of a plant.
+Secondary: TypeAlias = "PathModels | Plant"
 
 
 class Counter(Protocol):

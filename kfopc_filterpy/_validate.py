@@ -119,6 +119,14 @@ def as_number(value: Any, name: str, *, unit: str = "") -> float:
     return number
 
 
+def as_returned(value: Any, source: str) -> float:
+    """Return what a user's function returned as a float, NaN included; `source` names the function."""
+    try:
+        return float(np.asarray(value).reshape(()))
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{source} must return one number, got {value!r}") from error
+
+
 def as_positive(value: Any, name: str, *, unit: str = "") -> float:
     """Return `value` as a finite float above zero."""
     number = as_number(value, name, unit=unit)

@@ -5,8 +5,8 @@ A file is an archive of numpy's (``.npz``). It has the arrays of the object, eac
 bytes before it.
 
 An object in the header is the name of its class, and what ``__getstate__`` returns, for a copy and a file alike. What an
-object holds twice is still one thing. Only the package's own classes, filterpy's `KalmanFilter` and those that the caller
-of `load` passes can be named, and nothing in a file is code.
+object holds twice is still one thing. Only the package's own classes, and those that the caller of `load` passes, can be
+named; nothing else that a file names is looked up, and nothing in a file is code.
 """
 
 from __future__ import annotations
@@ -88,14 +88,15 @@ class Checkpointed:
         Examples
         --------
         >>> import os, tempfile
-        >>> from kfopc_filterpy import FxLMS
-        >>> controller = FxLMS(2, secondary_path=[1.0], step_size=0.1)
+        >>> from kfopc_filterpy import fx_lms
+        >>> from kfopc_filterpy.controllers import CoreController
+        >>> controller = fx_lms(2, [1.0], step_size=0.1)
         >>> controller.control_signal(1.0), controller.update(2.0)
         (0.0, None)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = os.path.join(folder, "run.npz")
         ...     controller.save(path)
-        ...     again = FxLMS.load(path)
+        ...     again = CoreController.load(path)
         >>> again.control_signal(1.0) == controller.control_signal(1.0)
         True
         """

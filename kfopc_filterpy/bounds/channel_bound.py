@@ -11,14 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.signal import fftconvolve
 
-from .._types import PathModels
-from .._validate import as_channels, as_count
+from .._validate import as_count
 from ..paths.least_squares import correlation_matrix, cross_correlation
-from ..paths.path_matrix import secondary_paths
 from .wiener import Record
 
 RIDGE = 1e-10  # of the mean energy of a tap: directions of the weights with less energy get no weight
@@ -151,26 +148,9 @@ class ChannelCorrelations:
         return step
 
 
-def channel_record(
-    reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int, fs: float
-) -> ChannelStretch:
-    """Check the signals of several channels and return them with silence before the first sample."""
-    x = np.atleast_2d(as_channels(reference, "reference"))
-    d = np.atleast_2d(as_channels(disturbance, "disturbance"))
-    secondary, _ = secondary_paths(secondary_path, fs=fs)
+def channel_record(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int) -> ChannelStretch:
+    """Return checked signals (I, n) and (K, n) of several channels, with silence before the first sample."""
     n_taps = as_count(n_taps, "n_taps")
-    if d.shape != (len(secondary), x.shape[1]):
-        raise ValueError(
-            f"disturbance must be (K microphones, n_samples) = {len(secondary), x.shape[1]}, got {d.shape}"
-        )
     filtered = fftconvolve(x[np.newaxis, np.newaxis], secondary[:, :, np.newaxis], axes=-1)[..., : x.shape[1]]
     past = [(0, 0), (n_taps - 1, 0)]
     return ChannelStretch(np.pad(x, past), np.pad(filtered, [(0, 0), (0, 0), *past]), d, n_taps)
-
-
-def full_channel_stretch(
-    reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int, fs: float
-) -> ChannelStretch:
-    """Check the signals and return the samples at which all delay lines are full."""
-    secondary, _ = secondary_paths(secondary_path, fs=fs)
-    return channel_record(reference, disturbance, secondary, n_taps, fs).full(secondary.shape[2])

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import PathModels
 from .._validate import as_count, as_signal
-from ..paths.models import path_taps
-from .wiener import full_stretch, loss_db, warn_of_loss
+from ..plant import Plant
+from .wiener import full_stretch, loss_db, one_channel, warn_of_loss
 
 
 def measurement_noise_from_run(
-    reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int
+    reference: ArrayLike, plant: Plant, *, n_taps: int, disturbance: ArrayLike | None = None
 ) -> float:
     r"""Estimate the measurement noise variance from a run without control.
 
@@ -23,13 +22,13 @@ def measurement_noise_from_run(
     ----------
     reference : array_like, shape (n_samples,)
         Reference x of the run.
-    disturbance : array_like, shape (n_samples,)
-        Signal of the error microphone, the disturbance d. Leave out its start-up transient, which would count as
-        unexplained.
-    secondary_path : array_like or control.TransferFunction
-        Estimated secondary path.
+    plant : Plant
+        Plant with the estimated secondary path.
     n_taps : int
         Number of taps L of the control filter.
+    disturbance : array_like, shape (n_samples,), optional
+        Signal of the error microphone, the disturbance d, in place of the plant's primary path. Leave out its start-up
+        transient, which would count as unexplained.
 
     Returns
     -------
@@ -53,12 +52,11 @@ def measurement_noise_from_run(
     >>> rng = np.random.default_rng(0)
     >>> x = rng.standard_normal(20000)
     >>> d = 0.5 * x + 0.1 * rng.standard_normal(20000)  # q = 0.01
-    >>> round(measurement_noise_from_run(x, d, [1.0], n_taps=8), 3)
+    >>> from kfopc_filterpy import Plant
+    >>> round(measurement_noise_from_run(x, Plant([1.0], fs=16000), n_taps=8, disturbance=d), 3)
     0.01
     """
-    x = as_signal(reference, "reference")
-    d = as_signal(disturbance, "disturbance", length=x.size)
-    s = path_taps(secondary_path, name="secondary_path")
+    x, d, s = one_channel(reference, plant, disturbance, "measurement_noise_from_run")
     n_taps = as_count(n_taps, "n_taps")
     transient = n_taps + s.size - 2
     if x.size < transient + 2 * n_taps:

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PathModels, PerLoudspeaker
+from .._types import NumberOrArray, PerLoudspeaker
 from .._validate import as_nonnegative, as_positive, as_sample_count, per_loudspeaker
 from ..metrics import overshoot
-from ..paths.models import path_taps
-from ..paths.path_matrix import is_path_matrix
+from ..plant import Plant, as_plant
 from . import wiener
-from .channel_bound import channel_record
+from .channel_bound import ChannelStretch, channel_record
 
 
 @dataclass(frozen=True)
@@ -201,7 +200,8 @@ class PowerConstrainedWiener:
         Examples
         --------
         >>> x = np.random.default_rng(0).standard_normal(4000) * np.repeat([1.0, 2.0], 2000)
-        >>> bound = power_constrained_wiener(x, x, [1.0], n_taps=8, rated_power=0.5, fs=1000.0)
+        >>> from kfopc_filterpy import Plant
+        >>> bound = power_constrained_wiener(x, Plant([1.0], [1.0], fs=1000), n_taps=8, rated_power=0.5)
         >>> print(f"{bound.whole.noise_reduction_db:.1f} dB, {bound.within_windows().noise_reduction_db:.1f} dB")
         5.2 dB, 3.1 dB
         """
@@ -221,12 +221,11 @@ class PowerConstrainedWiener:
 
 def power_constrained_wiener(
     reference: ArrayLike,
-    disturbance: ArrayLike,
-    secondary_path: PathModels,
+    plant: Plant,
+    *,
     n_taps: int,
     rated_power: PerLoudspeaker,
-    *,
-    fs: float,
+    disturbance: ArrayLike | None = None,
     segment_s: float = 1.0,
     switch_on_s: float = 0.0,
     ridge: float = 0.0,
@@ -263,17 +262,15 @@ def power_constrained_wiener(
     ----------
     reference : array_like, shape (n_samples,) or (I, n_samples)
         Reference signal x.
-    disturbance : array_like, shape (n_samples,) or (K, n_samples)
-        Disturbance d at the error microphone, with its sensor noise if the error is to include it.
-    secondary_path : control.TransferFunction or array_like, shape (n_path,) or (K, J, n_path)
-        Secondary path s with a finite response, at the signals' sampling rate; with several channels also a matrix of
-        systems, as for `simulate`.
+    plant : Plant
+        Plant, of which the paths and the sample rate count: the bound has linear amplifiers and no sensor noise.
     n_taps : int
         Length of the control filter.
     rated_power : float or array_like, shape (J,)
         Budget ρ_o, mean square of the control signal, of all loudspeakers or of each.
-    fs : float
-        Sampling rate in Hz.
+    disturbance : array_like, shape (n_samples,) or (K, n_samples), optional
+        Disturbance d at the error microphone, in place of the plant's primary path: one that was measured, or with its
+        sensor noise if the error is to include it.
     segment_s : float, default 1.0
         Length of a segment in seconds, at least ``2 n_taps`` samples. The rest at the end is a segment of its own, or
         part of the one before if it is shorter than half a segment.
@@ -294,7 +291,7 @@ def power_constrained_wiener(
     ------
     TypeError, ValueError
         If the signals differ in length, have fewer than `n_taps` samples that count, are silent in them, or are not
-        finite; if an argument is out of range, or `fs` is not that of `secondary_path`. A silent segment is no error: it
+        finite; if an argument is out of range, or the plant changes. A silent segment is no error: it
         needs no power and gets zero weights.
 
     Warns
@@ -318,8 +315,9 @@ def power_constrained_wiener(
     White noise, twice as strong in the last two of four seconds, and a secondary path that favours low frequencies:
 
     >>> x = np.random.default_rng(0).standard_normal(4000) * np.repeat([1.0, 2.0], 2000)
-    >>> d = np.concatenate([np.zeros(2), x[:-2]])
-    >>> bound = power_constrained_wiener(x, d, [1.0, 0.8], n_taps=8, rated_power=0.5, fs=1000.0)
+    >>> from kfopc_filterpy import Plant
+    >>> plant = Plant([1.0, 0.8], [0.0, 0.0, 1.0], fs=1000)
+    >>> bound = power_constrained_wiener(x, plant, n_taps=8, rated_power=0.5)
     >>> print(f"{bound.unconstrained.control_power:.1f}, {bound.whole.control_power:.3f}, {bound.whole.penalty:.2f}")
     4.8, 0.500, 0.93
     >>> bound.per_second.control_power.round(6)
@@ -329,17 +327,14 @@ def power_constrained_wiener(
     >>> {name: round(value, 1) for name, value in bound.noise_reduction_over(start_s=2.0).items()}
     {'whole': 5.6, 'per_second': 4.4, 'unconstrained': 16.0, 'scaled': 3.3, 'scaled_per_second': 2.5}
     """
-    fs = as_positive(fs, "fs", unit="Hz")
     ridge = as_nonnegative(ridge, "ridge")
-    record: wiener.Record
-    if is_path_matrix(secondary_path):
-        record = channel_record(reference, disturbance, secondary_path, n_taps, fs)
-        rated_power = per_loudspeaker(rated_power, record.shape[0], "rated_power")
+    as_plant(plant).require_constant("power_constrained_wiener")
+    x, d = plant.signals(reference, disturbance)
+    fs, record = plant.fs, record_of_any(x, d, plant, n_taps)
+    if isinstance(record, ChannelStretch):
+        rated_power = per_loudspeaker(rated_power, plant.n_loudspeakers, "rated_power")
     else:
         rated_power = as_positive(rated_power, "rated_power")
-        record = wiener.record_of(
-            reference, disturbance, path_taps(secondary_path, fs=fs, name="secondary_path"), n_taps
-        )
     first = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
     n_samples = record.d.shape[-1]
     if n_samples - first < record.n_taps:
@@ -380,7 +375,7 @@ def power_constrained_wiener(
 
 
 def power_constrained_solution(
-    reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int, rated_power: float
+    reference: ArrayLike, plant: Plant, *, n_taps: int, rated_power: float, disturbance: ArrayLike | None = None
 ) -> wiener.WienerSolution:
     """Return the least-squares control filter whose control power does not exceed the rated power.
 
@@ -391,7 +386,7 @@ def power_constrained_solution(
 
     Parameters
     ----------
-    reference, disturbance, secondary_path, n_taps
+    reference, plant, n_taps, disturbance
         As in `wiener_solution`.
     rated_power : float
         Rated power (mean square of the control signal).
@@ -418,16 +413,25 @@ def power_constrained_solution(
     Examples
     --------
     >>> x = np.random.default_rng(0).standard_normal(2000)
-    >>> solution = power_constrained_solution(x, 2 * x, [1.0], n_taps=1, rated_power=1.0)
+    >>> from kfopc_filterpy import Plant
+    >>> solution = power_constrained_solution(x, Plant([1.0], [2.0], fs=16000), n_taps=1, rated_power=1.0)
     >>> round(solution.control_power, 4)
     1.0
     """
     rated_power = as_positive(rated_power, "rated_power")
-    stretch = wiener.full_stretch(reference, disturbance, secondary_path, n_taps)
+    signals = wiener.one_channel(reference, plant, disturbance, "power_constrained_solution")
+    stretch = wiener.full_stretch(*signals, n_taps)
     correlations = stretch.correlations()
     weights, penalty = wiener.constrained_weights(stretch, correlations, rated_power)
     wiener.warn_of_loss(wiener.loss_db(stretch, correlations, weights, penalty))
     return stretch.solution(weights)
+
+
+def record_of_any(x: np.ndarray, d: np.ndarray, plant: Plant, n_taps: int) -> wiener.Record:
+    """Return the record of checked signals, (I, n) and (K, n): one channel has more exact solutions than several."""
+    if plant.has_one_channel(x):
+        return wiener.record_of(x[0], d[0], plant.secondary[0, 0], n_taps)
+    return channel_record(x, d, plant.secondary, n_taps)
 
 
 def _losses_db(counted: wiener.Record, whole: ControlFilter, unconstrained: ControlFilter, ridge: float) -> list[float]:

@@ -36,9 +36,10 @@ def predictor_reference(disturbance: ArrayLike) -> np.ndarray:
 
     >>> import numpy as np
     >>> from scipy.signal import lfilter
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.bounds import predictor_reference, wiener_solution
     >>> d = lfilter([1.0], [1.0, -0.9], np.random.default_rng(0).standard_normal(100_000))
-    >>> found = wiener_solution(predictor_reference(d), d, [0.0, 0.0, 1.0], n_taps=4)
+    >>> found = wiener_solution(predictor_reference(d), Plant([0, 0, 1.0], fs=16000), n_taps=4, disturbance=d)
     >>> round(found.error_power / found.disturbance_power, 2), round(1 - 0.9**6, 2)
     (0.47, 0.47)
     """

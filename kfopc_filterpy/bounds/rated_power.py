@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import PathModels
 from .._validate import as_choice, as_finite_array, as_positive, per_loudspeaker
-from ..paths.path_matrix import is_path_matrix
+from ..plant import Plant, as_plant
 from .channel_bound import ChannelCorrelations, channel_record
 from .wiener import reduction_db
 
@@ -160,11 +159,10 @@ def _wanted(noise_reduction_db: Any) -> np.ndarray:
 def budgeted_rated_power(
     noise_reduction_db: ArrayLike,
     reference: ArrayLike,
-    disturbance: ArrayLike,
-    secondary_path: PathModels,
-    n_taps: int,
+    plant: Plant,
     *,
-    fs: float,
+    n_taps: int,
+    disturbance: ArrayLike | None = None,
     proportions: ArrayLike | None = None,
     beyond: str = "raise",
 ) -> BudgetedRatedPower:
@@ -180,14 +178,12 @@ def budgeted_rated_power(
         Noise reductions wanted in dB, zero or above, over all microphones.
     reference : array_like, shape (n_samples,) or (I, n_samples)
         Reference signal x.
-    disturbance : array_like, shape (n_samples,) or (K, n_samples)
-        Disturbance d at the error microphones.
-    secondary_path : control.TransferFunction or array_like, shape (n_path,) or (K, J, n_path)
-        Secondary path s, at the signals' sampling rate; with several channels, a matrix of systems is also allowed.
+    plant : Plant
+        Plant, of which the paths count: the bound has linear amplifiers.
     n_taps : int
         Taps of each control filter.
-    fs : float
-        Sampling rate in Hz.
+    disturbance : array_like, shape (n_samples,) or (K, n_samples), optional
+        Disturbance d at the error microphones, in place of the plant's primary path.
     proportions : array_like, shape (J,), optional
         Proportions of the rated powers, such as ``[1, 1, 4]`` for a third loudspeaker with four times the power of the
         others; by default all are equal.
@@ -214,23 +210,24 @@ def budgeted_rated_power(
     --------
     Two loudspeakers of the same rated power, and two microphones:
 
-    >>> from kfopc_filterpy import power_constrained_wiener
+    >>> from kfopc_filterpy import Plant, power_constrained_wiener
     >>> from kfopc_filterpy.bounds import budgeted_rated_power
-    >>> x = np.random.default_rng(0).standard_normal((1, 4000))
-    >>> d = np.array([np.convolve(x[0], p)[:4000] for p in ([0, 0, 1.0, 0.5], [0, 0, 0.8, -0.2])])
+    >>> x = np.random.default_rng(0).standard_normal(4000)
     >>> paths = [[[0, 1.0, 0.6], [0, 0.3, 0.3]], [[0, 0.4, 0.1], [0, 1.0, -0.5]]]
-    >>> needed = budgeted_rated_power([3.0, 10.0], x, d, paths, 8, fs=8000.0)
+    >>> plant = Plant(paths, [[0, 0, 1.0, 0.5], [0, 0, 0.8, -0.2]], fs=8000)
+    >>> needed = budgeted_rated_power([3.0, 10.0], x, plant, n_taps=8)
     >>> needed.rated_power.round(3)
     array([[0.033, 0.033],
            [0.194, 0.194]])
-    >>> bound = power_constrained_wiener(x, d, paths, 8, needed.rated_power[1], fs=8000.0)
+    >>> bound = power_constrained_wiener(x, plant, n_taps=8, rated_power=needed.rated_power[1])
     >>> print(f"{bound.whole.noise_reduction_db:.2f} dB, scaled {bound.scaled.noise_reduction_db:.2f} dB")
     10.00 dB, scaled 5.99 dB
     """
     as_choice(beyond, "beyond", ("raise", "inf"))
     wanted = _wanted(noise_reduction_db)
-    several = is_path_matrix(secondary_path) or np.ndim(reference) > 1
-    record = channel_record(reference, disturbance, secondary_path, n_taps, fs).with_sound()
+    as_plant(plant).require_constant("budgeted_rated_power")
+    x, d = plant.signals(reference, disturbance)
+    record = channel_record(x, d, plant.secondary, n_taps).with_sound()
     shares = per_loudspeaker(1.0 if proportions is None else proportions, record.shape[0], "proportions")
     search = _ScaleSearch(record.correlations(), shares, float(np.sum(np.mean(record.d**2, axis=-1))))
     if beyond == "raise" and np.any(wanted > search.most_db + ROUNDING_DB):
@@ -240,7 +237,7 @@ def budgeted_rated_power(
         )
     found = np.array([search.powers(one) for one in wanted.ravel()])  # (n, 3, J)
     each = np.moveaxis(found, 1, 0).reshape(3, *wanted.shape, -1)
-    return BudgetedRatedPower(wanted, *(each if several else each[..., 0]))
+    return BudgetedRatedPower(wanted, *(each[..., 0] if plant.has_one_channel(x) else each))
 
 
 class _ScaleSearch:

@@ -11,14 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import PathModels
-from .._validate import as_channels, as_count, as_positive
+from .._validate import as_count, as_positive
 from ..paths.least_squares import RANK_TOLERANCE
-from ..paths.models import path_taps
-from ..paths.path_matrix import is_path_matrix, secondary_paths
-from ..power.constraint import DEFAULT_FS
-from .channel_bound import full_channel_stretch
-from .wiener import ERROR_THAT_MATTERS, Record, full_stretch, mean_square, reduction_db
+from ..plant import Plant, as_plant
+from .power_constrained import record_of_any
+from .wiener import ERROR_THAT_MATTERS, Record, mean_square, reduction_db
 
 # A longer memory leaves less error in a steady noise, and a shorter one follows changes: of a motor's speed, and of the
 # constraint factor when the noise gets louder or softer. `python tests/helpers/settings_grid.py` shows what this one costs.
@@ -59,17 +56,17 @@ class SuggestedSettings:
     reasons: Mapping[str, str]
 
     @property
-    def settings(self) -> dict[str, float]:
-        """Keyword arguments r, q and P0 of a filter: ``KFOPC.random_walk(s.n_taps, **s.settings)``."""
+    def noises(self) -> dict[str, float]:
+        """Keyword arguments r, q and P0 of a filter: ``kf_opc(s.n_taps, plant, rated_power=1.0, **s.noises)``."""
         return {name: getattr(self, name) for name in ("state_noise", "measurement_noise", "initial_variance")}
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{name}={value:.3g}" for name, value in self.settings.items())
+        values = ", ".join(f"{name}={value:.3g}" for name, value in self.noises.items())
         return f"<SuggestedSettings: n_taps={self.n_taps}, {values}, at {self.fs:g} Hz>"
 
     def __str__(self) -> str:
         lines = []
-        for name, value in {"n_taps": self.n_taps, **self.settings}.items():
+        for name, value in {"n_taps": self.n_taps, **self.noises}.items():
             lines.append(f"{name} = {value:.3g}")
             lines += textwrap.wrap(self.reasons[name], 100, initial_indent="    ", subsequent_indent="    ")
         return "\n".join(lines)
@@ -77,10 +74,9 @@ class SuggestedSettings:
 
 def suggest_settings(
     reference: ArrayLike,
-    disturbance: ArrayLike,
-    secondary_path: PathModels,
+    plant: Plant,
     *,
-    fs: float = DEFAULT_FS,
+    disturbance: ArrayLike | None = None,
     memory_s: float = DEFAULT_MEMORY_S,
     n_taps: int | None = None,
     max_taps: int = LONGEST,
@@ -94,12 +90,11 @@ def suggest_settings(
     ----------
     reference : array_like, shape (n_samples,) or (I, n_samples)
         Reference x of the silent run.
-    disturbance : array_like, shape (n_samples,) or (K, n_samples)
-        Signal of the error microphone, the disturbance d. Leave out its start-up transient.
-    secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control.TransferFunction
-        Estimated secondary path, or those from J loudspeakers to K microphones.
-    fs : float, default 16000
-        Sample rate of the signals in Hz.
+    plant : Plant
+        Plant with the estimated secondary path.
+    disturbance : array_like, shape (n_samples,) or (K, n_samples), optional
+        Signal of the error microphone, the disturbance d, in place of the plant's primary path. Leave out its start-up
+        transient.
     memory_s : float, default 0.25
         Memory of the filter in seconds. A longer one leaves less error, a shorter one follows changes of the noise and of
         the paths faster.
@@ -111,13 +106,13 @@ def suggest_settings(
     Returns
     -------
     SuggestedSettings
-        The settings, which `kf_anc`, `kf_opc` and `kf_pb` take in place of `n_taps`.
+        The settings: `n_taps` and `noises` are arguments of `kf_anc` and `kf_opc`.
 
     Raises
     ------
     TypeError, ValueError
-        If the signals differ in length, are too short, silent or not finite; if their channels do not fit the secondary
-        path, or that has another sample rate; if a setting is out of range.
+        If the signals differ in length, are too short, silent or not finite; if their channels do not fit the plant;
+        if a setting is out of range.
 
     See Also
     --------
@@ -158,22 +153,23 @@ def suggest_settings(
     Examples
     --------
     >>> import numpy as np
-    >>> from kfopc_filterpy import kf_opc, suggest_settings
+    >>> from kfopc_filterpy import Plant, kf_opc, suggest_settings
     >>> rng = np.random.default_rng(0)
     >>> x = rng.standard_normal(32000)
     >>> d = np.convolve(x, [0.0] * 19 + [1.0, 0.5])[:32000] + 0.1 * rng.standard_normal(32000)
-    >>> path = [0.0, 0.0, 0.8]
-    >>> suggested = suggest_settings(x, d, path)
+    >>> plant = Plant([0.0, 0.0, 0.8], fs=16000)
+    >>> suggested = suggest_settings(x, plant, disturbance=d)
     >>> suggested
     <SuggestedSettings: n_taps=24, state_noise=9.77e-10, measurement_noise=0.01, initial_variance=0.0821, at 16000 Hz>
     >>> print(suggested.reasons["state_noise"])
     the filter averages over 0.25 s; that costs up to 0.03 dB, and a shorter time follows faster
-    >>> kf_opc(suggested, path, rated_power=1.0).name
+    >>> kf_opc(suggested.n_taps, plant, rated_power=1.0, **suggested.noises).name
     'KF-OPC'
     """
-    fs = as_positive(fs, "fs", unit="Hz")
+    as_plant(plant).require_constant("suggest_settings")
+    fs = plant.fs
     memory = as_positive(memory_s, "memory_s", unit="s") * fs
-    fit = _Fits(reference, disturbance, secondary_path, fs, n_taps, max_taps)
+    fit = _Fits(*plant.signals(reference, disturbance), plant, n_taps, max_taps)
     longest, d_power, filtered_power = fit.stretch.n_taps, mean_square(fit.stretch.d), fit.filtered_power
     errors, quietest = fit.error_powers(0.0), ERROR_THAT_MATTERS * d_power
     if n_taps is None:
@@ -206,28 +202,13 @@ def suggest_settings(
 class _Fits:
     """Fixed filters of 1, 2, ... taps, fitted to one record."""
 
-    def __init__(
-        self,
-        reference: ArrayLike,
-        disturbance: ArrayLike,
-        secondary_path: PathModels,
-        fs: float,
-        n_taps: int | None,
-        max_taps: int,
-    ) -> None:
-        x = as_channels(reference, "reference")
-        self.stretch: Record
-        if is_path_matrix(secondary_path) or x.ndim == 2 or np.ndim(disturbance) == 2:
-            s, _ = secondary_paths(secondary_path, fs=fs)
-            self.n_microphones, self.per_tap = len(s), s.shape[1] * len(np.atleast_2d(x))
-            longest = _longest(x.shape[-1], s.shape[2], n_taps, max_taps, self.crowding)
-            self.stretch = full_channel_stretch(x, disturbance, s, longest, fs)
-            self.variance_rule = "K E[d^2] / (J I L E[x'^2])"
-        else:
-            s = path_taps(secondary_path, fs=fs, name="secondary_path")
-            self.n_microphones = self.per_tap = 1
-            self.stretch = full_stretch(x, disturbance, s, _longest(x.size, s.size, n_taps, max_taps, 1.0))
-            self.variance_rule = "E[d^2] / (L E[x'^2])"
+    def __init__(self, x: np.ndarray, d: np.ndarray, plant: Plant, n_taps: int | None, max_taps: int) -> None:
+        K, J, n_path = plant.secondary.shape
+        self.n_microphones, self.per_tap = K, J * len(x)
+        longest = _longest(x.shape[-1], n_path, n_taps, max_taps, self.crowding)
+        self.stretch: Record = record_of_any(x, d, plant, longest).full(n_path)
+        one = plant.has_one_channel(x)
+        self.variance_rule = "E[d^2] / (L E[x'^2])" if one else "K E[d^2] / (J I L E[x'^2])"
         self.filtered_power = self.stretch.filtered_power / self.per_tap
         powers = {"the filtered reference": self.filtered_power, "disturbance": mean_square(self.stretch.d)}
         for name, power in powers.items():

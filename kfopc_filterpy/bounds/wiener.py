@@ -15,10 +15,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import PathModels
 from .._validate import as_channels, as_count, as_nonnegative, as_positive, as_signal
 from ..paths.least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve
-from ..paths.models import path_taps
+from ..plant import Plant, as_plant
 
 # A control power that exceeds the rated one by no more than this share of it counts as within it.
 BUDGET_TOLERANCE = 1e-12
@@ -63,10 +62,10 @@ class WienerSolution:
 
 def wiener_solution(
     reference: ArrayLike,
-    disturbance: ArrayLike,
-    secondary_path: PathModels,
-    n_taps: int,
+    plant: Plant,
     *,
+    n_taps: int,
+    disturbance: ArrayLike | None = None,
     regularization: float = 0.0,
     control_penalty: float = 0.0,
 ) -> WienerSolution:
@@ -85,12 +84,12 @@ def wiener_solution(
     ----------
     reference : array_like, shape (n_samples,)
         Reference signal x.
-    disturbance : array_like, shape (n_samples,)
-        Disturbance d at the error microphone.
-    secondary_path : control.TransferFunction or array_like, shape (n_path,)
-        Secondary path s with a finite response, at the signals' sampling rate.
+    plant : Plant
+        Plant of one channel, of which the paths count: the bound has linear amplifiers.
     n_taps : int
         Length of the control filter.
+    disturbance : array_like, shape (n_samples,), optional
+        Disturbance d at the error microphone, if it was measured, in place of the plant's primary path.
     regularization : float, default 0.0
         Ridge λ, relative to the power of the filtered reference.
     control_penalty : float, default 0.0
@@ -124,13 +123,13 @@ def wiener_solution(
 
     Examples
     --------
-    >>> x = np.random.default_rng(0).standard_normal(2000)
-    >>> d = np.concatenate([np.zeros(3), 0.5 * x[:-3]])
-    >>> solution = wiener_solution(x, d, [0.0, 1.0], n_taps=4)  # P is three samples late, S one
+    >>> from kfopc_filterpy import Plant
+    >>> plant = Plant([0.0, 1.0], [0.0, 0.0, 0.0, 0.5], fs=16000)
+    >>> solution = wiener_solution(np.random.default_rng(0).standard_normal(2000), plant, n_taps=4)
     >>> solution.weights.round(6) + 0.0
     array([0. , 0. , 0.5, 0. ])
     """
-    stretch = full_stretch(reference, disturbance, secondary_path, n_taps)
+    stretch = full_stretch(*one_channel(reference, plant, disturbance, "wiener_solution"), n_taps)
     ridge = as_nonnegative(regularization, "regularization") * stretch.filtered_power
     penalty = as_nonnegative(control_penalty, "control_penalty")
     correlations = stretch.correlations()
@@ -322,7 +321,7 @@ class Record(ABC):
         """Return the record, or raise ValueError if x' or d is silent."""
         filtered_power = self.filtered_power
         if filtered_power == 0 or mean_square(self.d) == 0:
-            silent = "disturbance" if filtered_power else "reference through secondary_path"
+            silent = "disturbance" if filtered_power else "reference through the secondary path"
             raise ValueError(f"{silent} must not be silent: there is nothing to solve for")
         return self
 
@@ -364,24 +363,36 @@ class Stretch(Record):
         return np.convolve(self.filtered, weights, mode="valid")
 
 
-def record_of(reference: ArrayLike, disturbance: ArrayLike, secondary_path: np.ndarray, n_taps: int) -> Stretch:
-    """Check the signals and return copies of them, with silence before the first sample."""
+def one_channel(
+    reference: ArrayLike, plant: Plant, disturbance: ArrayLike | None, what: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return reference, disturbance and secondary path of one channel, in the name of what needs them."""
+    as_plant(plant).require_constant(what)
+    x, d = plant.signals(reference, disturbance)
+    if not plant.has_one_channel(x):
+        raise ValueError(
+            f"{what} takes one channel, got {len(x)} reference(s) and secondary paths {plant.secondary.shape[:2]}: "
+            "power_constrained_wiener takes several"
+        )
+    return x[0], d[0], plant.secondary[0, 0]
+
+
+def record_of(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int) -> Stretch:
+    """Return copies of checked signals, with silence before the first sample."""
     from scipy.signal import lfilter
 
-    x = as_signal(reference, "reference")
-    d = as_signal(disturbance, "disturbance", length=x.size).copy()
     n_taps = as_count(n_taps, "n_taps")
     past = np.zeros(n_taps - 1)
-    record = Stretch(np.concatenate([past, x]), np.concatenate([past, lfilter(secondary_path, 1.0, x)]), d, n_taps)
+    filtered = lfilter(secondary, 1.0, x)
+    record = Stretch(np.concatenate([past, x]), np.concatenate([past, filtered]), d.copy(), n_taps)
     for signal in (record.x, record.filtered, record.d):
         signal.flags.writeable = False
     return record
 
 
-def full_stretch(reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int) -> Stretch:
-    """Check the signals and return the samples at which the delay lines of w and s are full."""
-    taps = path_taps(secondary_path, name="secondary_path")
-    return record_of(reference, disturbance, taps, n_taps).full(taps.size)
+def full_stretch(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int) -> Stretch:
+    """Return the samples at which the delay lines of w and s are full."""
+    return record_of(x, d, secondary, n_taps).full(secondary.size)
 
 
 def mean_square(signal: np.ndarray) -> float:

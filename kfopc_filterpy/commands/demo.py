@@ -26,17 +26,17 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
 
 def demo(options: argparse.Namespace) -> int:
     """Write a reference, a disturbance and both paths: a compressor at 100 dB SPL in a duct."""
-    from ..paths import duct_paths, path_taps
+    from ..paths import duct_plant
     from ..signals import compressor_noise, write_wav
 
-    duct, rng = duct_paths(fs=FS), np.random.default_rng(7)
+    duct, rng = duct_plant(fs=FS), np.random.default_rng(7)
     sound = compressor_noise(SECONDS, fs=FS, rng=7, power=2.0**2)  # in Pa
-    primary = path_taps(duct.primary)
+    primary, secondary = duct.primary[0, 0], duct.secondary[0, 0]  # type: ignore[index]
     signals = {
         "noise": sound + MICROPHONE_NOISE * rng.standard_normal(sound.size),
         "d": np.convolve(sound, primary)[: sound.size] + MICROPHONE_NOISE * rng.standard_normal(sound.size),
         "P": primary,
-        "S": VOLTS_PER_UNIT * PASCAL_PER_VOLT * path_taps(duct.secondary),
+        "S": VOLTS_PER_UNIT * PASCAL_PER_VOLT * secondary,
     }
     files = {options.folder / f"{name}.wav": signal for name, signal in signals.items()}
     if there := [str(path) for path in files if path.exists()]:

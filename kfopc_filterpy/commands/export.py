@@ -22,7 +22,7 @@ EXAMPLES = """examples:
 controller.toml, where every other key is a keyword argument of the algorithm in Python:
   algorithm = "KF-OPC"         # a name of the table in docs/algorithms.md
   n_taps = 64
-  secondary_path = "S.wav"     # or taps, or a list of files, one for each loudspeaker
+  secondary = "S.wav"          # or taps, or a list of files, one for each loudspeaker
   fs = 16000                   # resample the path to this rate (default: the rate of the file)
   rated_power = 0.5
   state_noise = 1e-9
@@ -69,7 +69,6 @@ def export(options: argparse.Namespace) -> int:
 def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | None]:
     """Return the controller that a settings file describes, and its sample rate, None if nothing states it."""
     from .. import OutputLimiter, OutputPowerConstraint
-    from ..controllers.base import constraint_for
     from ..controllers.table import CORE
     from ..paths import PathTolerance
     from ..signals.content import require_file
@@ -82,8 +81,8 @@ def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | Non
     make = CORE[as_choice(settings.pop("algorithm", None), f"algorithm in {path}", CORE)]
     given_fs = settings.pop("fs", None)
     files = Files(argparse.Namespace(**vars(options) | {"fs": options.fs or given_fs}))
-    if "secondary_path" in settings:
-        settings["secondary_path"] = _paths(settings["secondary_path"], path.parent, files)
+    if "secondary" in settings:
+        settings["secondary"] = _paths(settings["secondary"], path.parent, files)
     fs = files.options.fs or files.fs or None
     parts: dict[str, Any] = {
         "limiter": OutputLimiter,
@@ -98,8 +97,6 @@ def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | Non
         elif isinstance(own, list) and own and isinstance(own[0], dict):
             settings[key] = [_made(parts[key], one, fs, where) for one in own]
     known = inspect.signature(make).parameters
-    if fs and "rated_power" in settings and "constraint" in known:
-        settings["constraint"] = constraint_for(settings.pop("rated_power"), settings.get("constraint"), fs)
     uncertainty = None if "secondary_path_uncertainty" in known else settings.pop("secondary_path_uncertainty", None)
     controller = _made(make, settings, fs, str(path))
     if uncertainty is not None:
@@ -112,7 +109,7 @@ def _paths(given: Any, folder: Path, files: Files) -> Any:
     names = [given] if isinstance(given, str) else given
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return given
-    matrix = files.matrix([str(folder / name) for name in names], "secondary_path")
+    matrix = files.matrix([str(folder / name) for name in names], "secondary")
     return matrix[0, 0] if matrix.shape[:2] == (1, 1) else matrix
 
 

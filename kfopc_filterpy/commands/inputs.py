@@ -19,6 +19,7 @@ from .printing import warn
 
 if TYPE_CHECKING:
     from ..paths.uncertainty import Uncertainty
+    from ..plant import Plant
     from ..signals import Recording
 
 STANDARD_INPUT = "-"
@@ -181,8 +182,9 @@ def _file(path: str) -> Iterator[str]:
         yield str(copy)
 
 
-def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, Any]:
-    """Return noise, primary path, secondary path and disturbance, each with its channels."""
+def scene_of(options: argparse.Namespace, files: Files) -> tuple[np.ndarray, Plant, np.ndarray | None]:
+    """Return the noise, (I, n_samples), the plant and the disturbance, (K, n_samples), if there is one."""
+    from .. import Plant
     from ..paths.file_checks import require_different
 
     if options.secondary is None:
@@ -218,7 +220,7 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, 
                 f"--disturbance must have a channel for each of the {len(secondary)} microphone(s) of --secondary, got "
                 f"{len(disturbance)}: record all microphones together, or choose one, as in {options.disturbance}:0"
             )
-    return noise, primary, secondary, disturbance
+    return noise, Plant(secondary, primary, fs=files.fs), disturbance
 
 
 def _each(given: list[Any] | None, option: str, count: int, what: str) -> list[Any]:
@@ -312,7 +314,7 @@ def _curve(path: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
 
 def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndarray) -> Uncertainty:
     """Return how far the secondary path may be wrong: from other measurements, from tolerances, or by default."""
-    from ..controllers.posterior import DEFAULT_UNCERTAINTY
+    from ..controllers.kf_pb import DEFAULT_UNCERTAINTY
     from ..paths import PathTolerance
     from ..paths.uncertainty import as_gain_error
 

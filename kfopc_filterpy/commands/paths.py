@@ -106,6 +106,7 @@ def _judge_residual(options: argparse.Namespace, residual_db: float, fs: float, 
 
 def inspect(options: argparse.Namespace) -> int:
     """Print a description of an impulse response."""
+    from .. import Plant
     from ..paths import causality_margin
     from ..paths.file_checks import require_sound
 
@@ -128,7 +129,7 @@ def inspect(options: argparse.Namespace) -> int:
     ]
     facts: dict[str, Any] = {"paths": each} if several else each[0]
     if primary is not None:
-        facts["causality_margin_s"] = causality_margin(primary, paths, fs=fs).margin_s
+        facts["causality_margin_s"] = causality_margin(Plant(paths, primary, fs=fs)).margin_s
     if options.json:
         print(json.dumps(jsonable(facts), allow_nan=False))
         return DONE
@@ -145,7 +146,8 @@ def inspect(options: argparse.Namespace) -> int:
 
 def _facts(taps: np.ndarray, fs: float) -> dict[str, Any]:
     """Return the properties of a path; a silent one has no band and no onset."""
-    from ..paths import achieved_band, causality_margin, secondary_path_gain
+    from ..paths import achieved_band, secondary_path_gain
+    from ..paths.analysis import energy_onset
 
     facts: dict[str, Any] = {"n_taps": taps.size, "fs": fs, "duration_s": taps.size / fs}
     if not np.any(taps):
@@ -155,7 +157,7 @@ def _facts(taps: np.ndarray, fs: float) -> dict[str, Any]:
         "power_gain_db": 10 * math.log10(max(secondary_path_gain(taps, band=(0.0, fs / 2), fs=fs), 1e-30)),
         "low_hz": band.low_hz,
         "high_hz": band.high_hz,
-        "onset_s": causality_margin(taps, taps, fs=fs).secondary_onset_s,
+        "onset_s": energy_onset(taps) / fs,
     }
 
 

@@ -128,16 +128,13 @@ def _simulated(options: argparse.Namespace) -> SimulatedInterface:
     if options.primary is not None and options.disturbance is not None:
         raise ValueError("--disturbance stands in place of --primary: leave out one of them")
     files = Files(options)
-    noise, primary, secondary, disturbance = scene_of(options, files)
+    noise, plant, disturbance = scene_of(options, files)
     _judge_length(options, noise.shape[-1] / files.fs)
-    if primary is None and disturbance is None:
-        noise, disturbance = None, noise
+    only_errors = plant.primary is None and disturbance is None
     return SimulatedInterface(
-        noise,
-        secondary,
-        primary_path=primary,
-        disturbance=disturbance,
-        fs=files.fs,
+        None if only_errors else noise,
+        plant,
+        disturbance=noise if only_errors else disturbance,
         block=options.block,
         latency=options.latency,
         clock=options.clock,

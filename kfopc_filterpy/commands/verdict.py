@@ -82,23 +82,20 @@ def verdict(options: argparse.Namespace) -> int:
         prepare_output(options)
     as_choice(options.algorithm, "--algorithm", CANDIDATES)
     files = Files(options)
-    noise, primary, secondary, disturbance = scene_of(options, files)
-    n_microphones, n_loudspeakers, _ = secondary.shape
+    noise, plant, disturbance = scene_of(options, files)
     with progress_bar(options, "sample") as bar:
         found = assess(
             noise,
-            primary,
-            secondary,
-            rating=ratings_of(options, n_loudspeakers),
-            fs=files.fs,
+            plant,
+            rating=ratings_of(options, plant.n_loudspeakers),
             disturbance=disturbance,
             want_db=options.want_db,
             algorithm=options.algorithm,
             beside=ALL if options.all else None,
             n_taps=options.taps,
             memory_s=options.memory,
-            secondary_path_uncertainty=uncertainty_of(options, files, secondary),
-            pascal_per_unit=calibration_of(options, files, n_microphones),
+            secondary_path_uncertainty=uncertainty_of(options, files, plant.secondary),
+            pascal_per_unit=calibration_of(options, files, plant.n_microphones),
             feedback=options.feedback,
             bar=bar,
         )

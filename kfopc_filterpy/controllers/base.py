@@ -15,7 +15,7 @@ from .._validate import as_positive
 from ..checkpoint import Checkpointed
 from ..core.block import InUse
 from ..core.run_loop import Steps
-from ..power.constraint import DEFAULT_FS, Constraints, OutputPowerConstraint
+from ..power.constraint import Constraints, OutputPowerConstraint
 from .processing import BlockProcessing
 
 
@@ -26,8 +26,7 @@ class Controller(Protocol):
     Optional attributes: `constraint_factor`, `disturbance_power` and `secondary_path_gain` are recorded if present, and
     `weights`, (L,), if requested. `name` names the result. `listen(references, errors)` follows the noise before the
     control is switched on. If a controller has `n_references`, `n_loudspeakers` or `n_microphones`, a run with other numbers
-    of channels is refused before it begins; otherwise the first sample shows the mismatch. `state()` and `restore(state)`
-    let `save` and `load` of a wrapper or a supervisor include it.
+    of channels is refused before it begins; otherwise the first sample shows the mismatch.
     """
 
     def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
@@ -39,23 +38,42 @@ class Controller(Protocol):
         ...
 
 
-def constraint_for(rated_power: PerLoudspeaker | None, constraint: Constraints, fs: float = DEFAULT_FS) -> Any:
-    """Return a new constraint for a controller: a copy of the one given, or one with default settings for the rate `fs`.
+def constraint_for(
+    rated_power: PerLoudspeaker | None, constraint: Constraints, fs: float | None, path_fs: float | None
+) -> Any:
+    """Return a new constraint for a controller: a copy of the one given, or one with default settings.
 
-    Several rated powers or constraints, one for each loudspeaker, give a tuple.
+    Its sample rate is `fs`, or that of the path, in Hz. Several rated powers or constraints, one for each loudspeaker,
+    give a tuple.
     """
     if (rated_power is None) == (constraint is None):
         raise ValueError("give either rated_power= or constraint=, an OutputPowerConstraint")
-    if isinstance(constraint, list | tuple):
-        return tuple(constraint_for(None, one) for one in constraint)
     if constraint is None:
-        powers: Any = rated_power
-        if np.ndim(powers) == 1:
-            return tuple(OutputPowerConstraint(power, fs=fs) for power in powers)
-        return OutputPowerConstraint(powers, fs=fs)
-    if not isinstance(constraint, OutputPowerConstraint):
-        raise TypeError(f"constraint must be an OutputPowerConstraint or None, got {constraint!r}")
-    return deepcopy(constraint)
+        rate, powers = as_run_rate(fs, path_fs), np.asarray(rated_power)
+        if powers.ndim == 1:
+            return tuple(OutputPowerConstraint(power, fs=rate) for power in powers)
+        return OutputPowerConstraint(rated_power, fs=rate)  # type: ignore[arg-type]
+    if fs is not None:
+        raise ValueError("fs belongs to rated_power: a constraint has its own, OutputPowerConstraint(..., fs=...)")
+    each = constraint if isinstance(constraint, list | tuple) else (constraint,)
+    for one in each:
+        if not isinstance(one, OutputPowerConstraint):
+            raise TypeError(f"constraint must be an OutputPowerConstraint or None, got {one!r}")
+    return deepcopy(tuple(each) if isinstance(constraint, list | tuple) else constraint)
+
+
+def as_run_rate(fs: float | None, path_fs: float | None) -> float:
+    """Return the sample rate in Hz of a law that depends on time: `fs`, or that of the secondary path."""
+    if fs is None and path_fs is None:
+        raise ValueError(
+            "fs must be given, the sample rate in Hz: the law depends on it, and taps have none; or give a Plant, a system "
+            "or a Recording as secondary"
+        )
+    if fs is None:
+        return path_fs  # type: ignore[return-value]
+    rate = as_positive(fs, "fs", unit="Hz")
+    require_rates(rate, {"secondary path": path_fs})
+    return rate
 
 
 def checked_controller(controller: Any) -> Any:
@@ -123,7 +141,7 @@ def _alone(step: Callable[..., Any]) -> Callable[..., Any]:
 class WrappedController(BlockProcessing, Checkpointed):
     """Base class of a controller that wraps another one and passes on its attributes."""
 
-    secondary_path = passed_on("secondary_path", "Estimated secondary path of the inner controller; can be assigned.")
+    secondary = passed_on("secondary", "Estimated secondary path of the inner controller; can be assigned.")
     secondary_path_uncertainty = passed_on(
         "secondary_path_uncertainty", "Uncertainty of that path; can be assigned if the inner controller's can."
     )

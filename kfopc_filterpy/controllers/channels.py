@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_count, as_number
-from ..paths.path_matrix import is_path_matrix, secondary_paths, single_path
+from ..plant import estimated_secondary
 from .base import require_rates
 from .channel_samples import channel_sample
 from .processing import takes_none
@@ -19,32 +19,31 @@ class Channels:
     n_references: int
     n_microphones: int
     n_loudspeakers: int
-    multichannel: bool
-    _path_fs: float | None
+    _path_fs: float | None  # sample rate in Hz of the secondary path; None for taps
 
-    def _read_paths(self, paths: Any, n_references: int | None, multichannel: bool | None) -> np.ndarray:
-        """Set the numbers of channels and return the taps of the secondary path."""
-        several = is_path_matrix(paths)
-        if several and n_references is None:
-            raise ValueError(
-                f"{type(self).__name__} takes one channel: secondary_path must be one-dimensional, (taps,), or a system "
-                "of one input and one output. Controllers with the setting n_references take several channels, for "
-                "example kf_anc, kf_opc, kf_pb and FxLMS"
-            )
+    @property
+    def multichannel(self) -> bool:
+        """Whether signals have a channel axis: there are several references, microphones or loudspeakers."""
+        return max(self.n_references, self.n_microphones, self.n_loudspeakers) > 1
+
+    def _read_paths(self, secondary: Any, n_references: int | None) -> np.ndarray:
+        """Set the numbers of channels and return the taps of the secondary paths, (K, J, n_taps)."""
+        taps, self._path_fs = self._taps_and_rate(secondary)
+        self.n_microphones, self.n_loudspeakers, _ = taps.shape
         self.n_references = 1 if n_references is None else as_count(n_references, "n_references")
-        self.multichannel = several or self.n_references > 1 if multichannel is None else multichannel
-        self.n_microphones, self.n_loudspeakers = 1, 1
-        secondary, self._path_fs = self._taps_and_rate(paths)
-        if self.multichannel:
-            self.n_microphones, self.n_loudspeakers, _ = secondary.shape
-        return secondary
+        if n_references is None and self.multichannel:
+            raise ValueError(
+                f"this controller takes one channel: secondary must be one path, (n_taps,), got {taps.shape}. Controllers "
+                "with the setting n_references take several channels, for example kf_anc, kf_opc, kf_pb and fx_lms"
+            )
+        return taps
 
-    def _taps_and_rate(self, paths: Any) -> tuple[np.ndarray, float | None]:
-        """Return secondary paths as taps, (K, J, taps) or (taps,), and their sampling rate in Hz if systems tell it."""
-        taps, rate = secondary_paths(paths) if self.multichannel else single_path(paths, "secondary_path")
+    def _taps_and_rate(self, secondary: Any) -> tuple[np.ndarray, float | None]:
+        """Return secondary paths as taps, (K, J, n_taps), and their sample rate in Hz if they tell it."""
+        taps, rate = estimated_secondary(secondary)
         if not taps.any():
             raise ValueError(
-                "secondary_path must not be all zeros: nothing that the loudspeaker plays would be heard, so there is "
+                "secondary must not be all zeros: nothing that the loudspeaker plays would be heard, so there is "
                 "nothing to adapt to; identify the path, see paths.identify_secondary_path"
             )
         return taps, rate
@@ -55,21 +54,22 @@ class Channels:
             return np.empty(0)
         if self.multichannel:
             return channel_sample(value, getattr(self, f"n_{what}"), name, what)
-        return as_number(value, name)
+        return as_number(value[0] if np.shape(value) == (1,) else value, name)
 
-    def _checked_estimate(self, path: Any, present: tuple[int, ...]) -> np.ndarray:
+    def _checked_estimate(self, secondary: Any, present: tuple[int, ...]) -> np.ndarray:
         """Return the taps of a new secondary path, filled with zeros to the shape of the present one."""
-        taps, rate = self._taps_and_rate(path)
-        if taps.shape[:-1] != present[:-1]:
+        taps, rate = self._taps_and_rate(secondary)
+        channels = (self.n_microphones, self.n_loudspeakers)
+        if taps.shape[:-1] != channels:
             raise ValueError(
-                f"secondary_path must have the channels (microphones, loudspeakers) = {present[:-1]} of the present "
-                f"estimate, got {taps.shape[:-1]}: make a new controller for other channels"
+                f"secondary must have the channels (microphones, loudspeakers) = {channels} of the present estimate, got "
+                f"{taps.shape[:-1]}: make a new controller for other channels"
             )
         if taps.shape[-1] > present[-1]:
             raise ValueError(
-                f"secondary_path must have at most the {present[-1]} taps of the present estimate, got "
-                f"{taps.shape[-1]}: make the controller with an estimate filled with zeros to the longest path"
+                f"secondary must have at most the {present[-1]} taps of the present estimate, got {taps.shape[-1]}: make "
+                "the controller with an estimate filled with zeros to the longest path"
             )
         if self._path_fs is not None:
             require_rates(self._path_fs, {"new secondary path": rate})
-        return np.pad(taps, [(0, 0)] * (taps.ndim - 1) + [(0, present[-1] - taps.shape[-1])])
+        return np.pad(taps, ((0, 0), (0, 0), (0, present[-1] - taps.shape[-1]))).reshape(present)

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from .._types import PathModels, PerLoudspeaker
+from .._types import PerLoudspeaker, Secondary
 from ..power.limiter import Limiters
-from .core_controller import CoreController, setting
+from .core_controller import CoreController
+from .making import controller_maker
 
 
-class ClippingFxLMS(CoreController):
-    r"""Clipping FxLMS: the control signal is clipped to the limit, the weights adapt as in `FxLMS`.
+@controller_maker
+def clipping_fx_lms(
+    n_taps: int,
+    secondary: Secondary,
+    *,
+    step_size: float,
+    amplitude_limit: PerLoudspeaker,
+    n_references: int = 1,
+    limiter: Limiters = None,
+) -> CoreController:
+    r"""Return clipping FxLMS: the control signal is clipped to the limit, the weights adapt as in `fx_lms`.
 
     With several loudspeakers, each control signal is clipped to its own limit.
 
@@ -17,10 +27,15 @@ class ClippingFxLMS(CoreController):
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, n_references, limiter
-        As for `FxLMS`.
+    n_taps, secondary, step_size, n_references, limiter
+        As for `fx_lms`.
     amplitude_limit : float or array_like, shape (J,)
         Amplitude limit A of each control signal, above zero; sqrt(2 rated_power) for a sine.
+
+    Returns
+    -------
+    CoreController
+        A controller named clipping FxLMS.
 
     Raises
     ------
@@ -34,29 +49,20 @@ class ClippingFxLMS(CoreController):
 
     Examples
     --------
-    >>> from kfopc_filterpy import ClippingFxLMS
-    >>> controller = ClippingFxLMS(1, secondary_path=[1.0], step_size=1.0, amplitude_limit=1.5)
+    >>> from kfopc_filterpy import clipping_fx_lms
+    >>> controller = clipping_fx_lms(1, [1.0], step_size=1.0, amplitude_limit=1.5)
     >>> controller.control_signal(1.0)
     0.0
     >>> controller.update(2.0)
     >>> controller.control_signal(1.0), float(controller.weights[0])
     (1.5, 2.0)
     """
-
-    name = "clipping FxLMS"
-    algorithm = "clipping"
-    step_size = setting("Step size mu.")
-    amplitude_limit = setting("Amplitude limit A of the control signal; with several channels (J,), a copy.")
-
-    def __init__(
-        self,
-        n_taps: int,
-        secondary_path: PathModels,
-        *,
-        step_size: float,
-        amplitude_limit: PerLoudspeaker,
-        n_references: int = 1,
-        limiter: Limiters = None,
-    ) -> None:
-        settings = {"step_size": step_size, "amplitude_limit": amplitude_limit}
-        super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
+    return CoreController(
+        "clipping FxLMS",
+        "clipping",
+        n_taps,
+        secondary,
+        settings={"step_size": step_size, "amplitude_limit": amplitude_limit},
+        n_references=n_references,
+        limiter=limiter,
+    )

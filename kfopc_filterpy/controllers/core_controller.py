@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PathModels, PerLoudspeaker
-from .._validate import as_count, as_positive, per_channel, per_loudspeaker
+from .._types import NumberOrArray, PerLoudspeaker, Secondary
+from .._validate import as_count, as_nonnegative, as_positive, per_channel, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..core.block import REASONS, Algorithm, Block, InUse, Shape
 from ..core.run_loop import REFUSED_REFERENCE, Steps, process
@@ -27,49 +27,34 @@ OVERFLOW = (
     "the disturbance estimate, the reference and the filtered reference must have finite squares, and one overflows: "
     "nothing was changed; scale the signals, or use a smaller step"
 )
+# Settings that may be zero; the others must be positive.
+MAY_BE_ZERO = {"leak", "state_noise", "measurement_noise", "initial_variance", "regularization", "spread"}
+MAY_BE_ZERO |= {"penalty_factor", "modified"}
 LONGEST_CALL = 1600  # samples between two opportunities to interrupt a block: 0.1 s at 16 kHz
 # What a run records of each loudspeaker, by its name in the constraint's numbers.
 RECORDED = {"constraint_factor": "factor", "disturbance_power": "power", "secondary_path_gain": "gain"}
 
 
-class setting:
-    """An attribute of a controller for the algorithm's setting of the same name, with its docstring."""
-
-    def __init__(self, doc: str, *, assignable: bool = False) -> None:
-        self.__doc__, self.assignable = doc, assignable
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
-
-    def __get__(self, controller: Any, kind: type) -> Any:
-        return self if controller is None else controller._of_setting(self.name)
-
-    def __set__(self, controller: Any, value: Any) -> None:
-        if not self.assignable:
-            raise AttributeError(f"{self.name} cannot be assigned: make a new controller")
-        with controller.in_use:
-            controller._block.fields[self.name][:] = controller._checked_setting(self.name, value)
-
-
 class CoreController(Channels, BlockProcessing, Checkpointed):
-    """Base class of the built-in controllers: channels, paths, limiter, constraint, and an algorithm of the core.
+    """A controller whose algorithm is in the core: `kf_opc`, `kf_pb`, `fx_lms` and the others return it.
 
-    A subclass names its `algorithm` in C and the `checks` of its settings, and passes the settings by their names in C.
+    It has the channels, the estimated secondary path, the limiter, the constraint and the settings of its algorithm,
+    which can be read as attributes, such as ``controller.step_size``.
 
     Parameters
     ----------
+    name : str
+        Name in results and legends.
+    algorithm : str
+        Name of the algorithm in the core.
     n_taps : int
         Taps L of the control filter, or of each of them.
-    secondary_path : array_like, shape (taps,) or (K, J, taps), or control system
-        Estimated secondary path, taps or an FIR system; with channel axes, those from loudspeaker j to microphone k.
+    secondary : array_like, shape (n_taps,) or (K, J, n_taps), control system, Recording or Plant
+        Estimated secondary path, or those from loudspeaker j to microphone k.
     settings : mapping
-        Settings of the algorithm, as a user gave them: a number each, or also (J,) or (K,) where each
-        loudspeaker or microphone has its own.
+        Settings of the algorithm: a number each, or also (J,) or (K,) where each loudspeaker or microphone has its own.
     n_references : int, default 1
         Number of references I; None: the algorithm takes one channel only.
-    multichannel : bool, optional
-        Whether signals have a channel axis; by default if the secondary path has channel axes or there are several
-        references.
     amplifier : callable or sequence of J of them, optional
         Known amplifier: the disturbance is then estimated with s^ * amplifier(y), not s^ * y.
     rated_power : float or array_like, shape (J,), optional
@@ -77,49 +62,34 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     constraint : OutputPowerConstraint or sequence of J of them, optional
         Given instead of `rated_power`: the constraint that computes the powers and the factor. A copy is kept. By default
         one whose factor is fixed at 1.
+    fs : float, optional
+        Sample rate in Hz for `rated_power`; a system, a recording or a plant as `secondary` brings it.
     limiter : OutputLimiter or sequence of J of them, optional
         Limiter of the control signal, not shared with another controller.
 
     Attributes
     ----------
-    algorithm : str
-        Name of an algorithm of the core. An attribute of the class.
-    checks : mapping of str to callable
-        Functions of a value and its name that return a setting as a float, or raise ValueError; settings without one
-        must be positive. An attribute of the class.
-    needs_rated_power : bool
-        Whether a rated power or a constraint must be given. An attribute of the class.
     internal_model : bool
         Whether the last references come from an internal model, see `with_internal_model`; `n_references` are the others.
 
     Raises
     ------
     ValueError
-        A setting that its check refuses or that is out of the range that the C file states, fewer than one tap or
-        reference, a path that is not FIR.
+        A setting that is out of range, fewer than one tap or reference, a path that is not FIR, a rated power without a
+        sample rate.
     TypeError
         A setting that the algorithm does not have, or a limiter that is not an `OutputLimiter`.
 
     Examples
     --------
-    >>> from kfopc_filterpy.controllers import CoreController
-    >>> class PlainFxLMS(CoreController):
-    ...     name, algorithm = "plain FxLMS", "fxlms"
-    ...
-    ...     def __init__(self, n_taps, secondary_path, *, step_size):
-    ...         super().__init__(n_taps, secondary_path, settings={"step_size": step_size})
-    >>> controller = PlainFxLMS(4, secondary_path=[1.0], step_size=0.1)
-    >>> controller.control_signal(1.0)
-    0.0
-    >>> controller.update(2.0)  # e = d: nothing is cancelled yet
-    >>> float(controller.weights[0])  # 0.1 * 2 * 1
-    0.2
+    >>> from kfopc_filterpy import fx_lms
+    >>> controller = fx_lms(4, [1.0], step_size=0.1)
+    >>> controller
+    <FxLMS: 4 taps, constraint factor 1>
+    >>> controller.step_size
+    0.1
     """
 
-    name = "controller"
-    algorithm: str
-    checks: ClassVar[Mapping[str, Callable[[Any, str], float]]] = {}  # of settings that need not be positive
-    needs_rated_power: ClassVar[bool] = False  # or a constraint
     takes_guard: ClassVar[bool] = True  # whether the step takes account of an uncertain secondary path
     internal_model: bool = False
     _block: Block
@@ -127,33 +97,47 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
     def __init__(
         self,
+        name: str,
+        algorithm: str,
         n_taps: int,
-        secondary_path: PathModels,
+        secondary: Secondary,
         *,
         settings: Mapping[str, Any],
         n_references: int | None = 1,
-        multichannel: bool | None = None,
         amplifier: Amplifiers = None,
         rated_power: PerLoudspeaker | None = None,
         constraint: Constraints = None,
+        fs: float | None = None,
         limiter: Limiters = None,
     ) -> None:
-        self._constrained = self.needs_rated_power or rated_power is not None or constraint is not None
-        own = constraint_for(rated_power, constraint) if self._constrained else None
-        self._settings = dict(settings)
+        self.name, self.algorithm = name, algorithm
         self.n_taps = as_count(n_taps, "n_taps")
-        secondary = self._read_paths(secondary_path, n_references, multichannel)
+        path = self._read_paths(secondary, n_references)
+        self._constrained = rated_power is not None or constraint is not None
         self._limiter = self._checked_limiter(limiter)
-        self._own_constraint = self._checked_constraint(own)
+        self._own_constraint = self._checked_constraint(
+            constraint_for(rated_power, constraint, fs, self._path_fs) if self._constrained else None
+        )
         models = amplifier_models(amplifier, self.n_loudspeakers)
         block = Block(
-            self._algorithm(),
-            self._needed_shape(secondary.shape[-1], guard_taps=0),
-            path=secondary.reshape(self.n_microphones, self.n_loudspeakers, -1),
-            settings=self._checked_settings(),
+            Algorithm(algorithm),
+            self._needed_shape(path.shape[-1], guard_taps=0),
+            path=path,
+            settings=self._checked_settings(settings),
         )
         block.fields["amplifier"][0, 0] = models.view(np.float64).reshape(self.n_loudspeakers, -1)
         self._use_block(block)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a setting of the algorithm: a number, or with several channels (J,) or (K,) where each has its own."""
+        if not name.startswith("_") and name in (one.name for one in Algorithm(self.algorithm).settings):
+            return self._of_setting(name)
+        raise AttributeError(f"{type(self).__name__} {self.__dict__.get('name', '')!r} has no attribute {name!r}")
+
+    @property
+    def shares_gains(self) -> bool:
+        """Whether runs that differ only in what they measure can share this controller's gains, see `simulate`."""
+        return not self.internal_model
 
     # Channels: numbers with one, arrays with several.
 
@@ -166,28 +150,31 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         return self._shaped(self._block.fields[name].ravel())
 
     def _by_channel(self, name: str) -> np.ndarray:
-        """Return a field of filters, (outputs, inputs, taps) or (taps,), in the core's memory."""
-        filters = self._block.fields[name][0]
-        return filters if self.multichannel else filters[0, 0]
+        """Return a field of filters, (outputs, inputs, taps), or (taps,) with one channel, in the core's memory."""
+        return self._by_count(self._block.fields[name][0])
+
+    def _by_count(self, filters: np.ndarray) -> np.ndarray:
+        """Return filters (outputs, inputs, taps) as users see them: the only one of one channel is (taps,)."""
+        return filters if self.multichannel or filters.shape[:2] != (1, 1) else filters[0, 0]
 
     # Checks of what the user gives.
 
-    def _checked_settings(self) -> dict[str, Any]:
+    def _checked_settings(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings, checked."""
-        wanted = {one.name for one in self._algorithm().settings}
-        if set(self._settings) != wanted:
-            raise TypeError(f"{self.name} has the settings {sorted(wanted)}, got {sorted(self._settings)}")
-        return {name: self._checked_setting(name, value) for name, value in self._settings.items()}
+        wanted = {one.name for one in Algorithm(self.algorithm).settings}
+        if set(settings) != wanted:
+            raise TypeError(f"{self.name} has the settings {sorted(wanted)}, got {sorted(settings)}")
+        return {name: self._checked_setting(name, value) for name, value in settings.items()}
 
     def _checked_setting(self, name: str, value: Any) -> Any:
         """Return a checked setting: a number, or an array if each of several channels has its own."""
-        check = self.checks.get(name, as_positive)
+        check = as_nonnegative if name in MAY_BE_ZERO else as_positive
         each = self._who_has(name)
         return per_channel(value, getattr(self, f"n_{each}"), each, name, check) if each else check(value, name)
 
     def _who_has(self, name: str) -> str:
         """Return which channels have a setting each, "loudspeakers" or "microphones"; "" if all share one."""
-        each = next(one.each for one in self._algorithm().settings if one.name == name)
+        each = next(one.each for one in Algorithm(self.algorithm).settings if one.name == name)
         return each if self.multichannel else ""
 
     def _checked_limiter(self, limiter: Any) -> Any:
@@ -207,7 +194,8 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     def _checked_constraint(self, own: Any) -> Any:
         """Return a constraint, or a tuple of them; if none is given, one whose factor is fixed at 1."""
         if own is None:
-            own = OutputPowerConstraint(1.0)
+            # Its powers are recorded, nothing else: without a known rate their memory is 8000 samples.
+            own = OutputPowerConstraint(1.0, fs=self._path_fs or 16000.0)
             own.factor = 1.0
         if not self.multichannel:
             if isinstance(own, tuple):
@@ -288,6 +276,11 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         values = self._block.fields[name].ravel()
         return values.copy() if self._who_has(name) else float(values[0])
 
+    def _take_setting(self, name: str, value: Any) -> None:
+        """Assign a setting, checked."""
+        with self.in_use:
+            self._block.fields[name][:] = self._checked_setting(name, value)
+
     # Assignments.
 
     @property
@@ -311,7 +304,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
             self._remake_block()
 
     @property
-    def secondary_path(self) -> np.ndarray:
+    def secondary(self) -> np.ndarray:
         """Estimated secondary path s^, (n_path,), or with several channels (K, J, n_path); a copy.
 
         A new estimate can be assigned between two samples, also during a run: taps or an FIR system, or paths with the
@@ -322,9 +315,9 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         """
         return self._estimated_path().copy()
 
-    @secondary_path.setter
-    def secondary_path(self, path: PathModels) -> None:
-        before = self.secondary_path
+    @secondary.setter
+    def secondary(self, path: Secondary) -> None:
+        before = self.secondary
         after = self._checked_estimate(path, before.shape)
         guard_filter(self._uncertainty, after)  # raises if none can be made, before anything changes
         with self.in_use:
@@ -385,7 +378,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     def rated_power(self, value: PerLoudspeaker) -> None:
         if self.rated_power is None:
             raise ValueError(
-                f"{self.name} has no rated power that could be changed; kf_opc, kf_pb and MOVFxLMS, for example, have one"
+                f"{self.name} has no rated power that could be changed; kf_opc, kf_pb and mov_fx_lms, for example, have one; a limiter keeps one whatever the controller asks for"
             )
         if self.multichannel:
             value = per_loudspeaker(value, self.n_loudspeakers, "rated_power")

@@ -4,16 +4,43 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._types import PathModels, PerLoudspeaker
-from .._validate import as_nonnegative
+from .._types import PerLoudspeaker, Secondary
 from ..power.amplifiers import Amplifiers
 from ..power.constraint import Constraints
 from ..power.limiter import Limiters
-from .core_controller import CoreController, setting
+from .core_controller import CoreController
+from .making import controller_maker
 
 
-class DiagonalKalman(CoreController):
-    r"""Reduced-complexity Kalman filter: eq. 2-9 with P reduced to its diagonal p, an NLMS with a step for each tap.
+class DiagonalInCore(CoreController):
+    """The diagonal Kalman filter: what can be read of its state."""
+
+    @property
+    def variances(self) -> np.ndarray:
+        """Diagonal of P, (L,), with several channels (J, I, L); a copy."""
+        return self._by_channel("variances").copy()
+
+    def _after_new_path(self, before: np.ndarray) -> None:
+        """Let the variances grow by that which the new path gives to the weights."""
+        self._block.fields["variances"][:] += self._variance_by_new_path(before)
+
+
+@controller_maker
+def diagonal_kf(
+    n_taps: int,
+    secondary: Secondary,
+    *,
+    state_noise: float,
+    measurement_noise: float,
+    initial_variance: float = 1.0,
+    rated_power: PerLoudspeaker | None = None,
+    constraint: Constraints = None,
+    fs: float | None = None,
+    n_references: int = 1,
+    amplifier: Amplifiers = None,
+    limiter: Limiters = None,
+) -> DiagonalInCore:
+    r"""Return the diagonal Kalman filter: eq. 2-9 with P reduced to its diagonal p, an NLMS with a step for each tap.
 
     .. math::
 
@@ -36,8 +63,8 @@ class DiagonalKalman(CoreController):
 
     Parameters
     ----------
-    n_taps, secondary_path, n_references, limiter
-        As for `FxLMS`.
+    n_taps, secondary, n_references, limiter
+        As for `fx_lms`.
     state_noise, measurement_noise, initial_variance
         r, q and P(0|0) as for `kf_anc`; q is that of all microphones.
     rated_power : float or array_like, shape (J,), optional
@@ -45,13 +72,15 @@ class DiagonalKalman(CoreController):
         of eq. 13. By default there is no constraint, alpha = 1.
     constraint : OutputPowerConstraint or sequence of J of them, optional
         Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
+    fs : float, optional
+        Sample rate in Hz of the power estimates; a system, a recording or a plant as `secondary` brings it.
     amplifier : callable or sequence of J of them, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
 
-    Attributes
-    ----------
-    variances : ndarray
-        (L,) diagonal of P, with several channels (J, I, L); a copy.
+    Returns
+    -------
+    CoreController
+        A controller named diagonal KF, or diagonal KF-OPC with a rated power. Its `variances` are the diagonal of P.
 
     Raises
     ------
@@ -68,57 +97,28 @@ class DiagonalKalman(CoreController):
 
     Examples
     --------
-    >>> from kfopc_filterpy import DiagonalKalman
-    >>> controller = DiagonalKalman(4, [1.0], state_noise=0.0, measurement_noise=1.0)
+    >>> from kfopc_filterpy import diagonal_kf
+    >>> controller = diagonal_kf(4, [1.0], state_noise=0.0, measurement_noise=1.0)
     >>> controller.control_signal(1.0)
     0.0
     >>> controller.update(2.0)
     >>> float(controller.weights[0]), float(controller.variances[0])  # K = 1 / (1 + 1)
     (1.0, 0.5)
     """
-
-    name = "diagonal KF"
-    algorithm = "diagonal"
-    checks = dict.fromkeys(("state_noise", "measurement_noise", "initial_variance"), as_nonnegative)
-    state_noise = setting("State noise variance r.")
-    measurement_noise = setting("Measurement noise variance q.")
-
-    def __init__(
-        self,
-        n_taps: int,
-        secondary_path: PathModels,
-        *,
-        state_noise: float,
-        measurement_noise: float,
-        initial_variance: float = 1.0,
-        rated_power: PerLoudspeaker | None = None,
-        constraint: Constraints = None,
-        amplifier: Amplifiers = None,
-        n_references: int = 1,
-        limiter: Limiters = None,
-    ) -> None:
-        super().__init__(
-            n_taps,
-            secondary_path,
-            settings={
-                "state_noise": state_noise,
-                "measurement_noise": measurement_noise,
-                "initial_variance": initial_variance,
-            },
-            n_references=n_references,
-            amplifier=amplifier,
-            rated_power=rated_power,
-            constraint=constraint,
-            limiter=limiter,
-        )
-        if self._constrained:
-            self.name = "diagonal KF-OPC"
-
-    @property
-    def variances(self) -> np.ndarray:
-        """Diagonal of P, (L,), with several channels (J, I, L); a copy."""
-        return self._by_channel("variances").copy()
-
-    def _after_new_path(self, before: np.ndarray) -> None:
-        """Let the variances grow by that which the new path gives to the weights."""
-        self._block.fields["variances"][:] += self._variance_by_new_path(before)
+    return DiagonalInCore(
+        "diagonal KF" if rated_power is None and constraint is None else "diagonal KF-OPC",
+        "diagonal",
+        n_taps,
+        secondary,
+        settings={
+            "state_noise": state_noise,
+            "measurement_noise": measurement_noise,
+            "initial_variance": initial_variance,
+        },
+        n_references=n_references,
+        amplifier=amplifier,
+        rated_power=rated_power,
+        constraint=constraint,
+        fs=fs,
+        limiter=limiter,
+    )

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PathModels
-from .._validate import as_channels, as_number
-from ..paths.path_matrix import feedback_paths, is_path_matrix
+from .._types import NumberOrArray, Secondary
+from .._validate import as_channels
+from ..paths.path_matrix import feedback_paths
+from ..plant import Plant
 from ..power.amplifiers import Amplifiers
 from .base import Controller, WrappedController, differing_counts, listening
 from .channel_samples import PlayedSound, channel_sample
@@ -27,7 +28,7 @@ class FeedbackNeutralizer(WrappedController):
     ----------
     controller : Controller
         Any controller: a built-in one, a wrapped one, or one of your own.
-    feedback_path : array_like, shape (taps,) or (I, J, taps), or control system
+    feedback : array_like, shape (taps,) or (I, J, taps), control system, Recording, or Plant with a feedback path
         Identified path from the loudspeaker to the reference microphone, or those from J loudspeakers to I reference
         microphones, see `paths.estimate_path`. Its first tap must be 0: sound takes time.
     amplifier : callable or sequence of J of them, optional
@@ -53,48 +54,43 @@ class FeedbackNeutralizer(WrappedController):
     The same result as without feedback, if the path is known exactly:
 
     >>> import numpy as np
-    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy import Plant, fx_lms, simulate
     >>> from kfopc_filterpy.controllers import FeedbackNeutralizer
     >>> x = np.random.default_rng(0).standard_normal(2000)
-    >>> feedback = [0.0, 0.9, -0.5]
-    >>> plant = {"primary_path": [0.0, 0.0, 0.0, 1.0], "secondary_path": [0.0, 1.0]}
-    >>> free = simulate(FxLMS(8, [0.0, 1.0], step_size=0.01), x, **plant)
-    >>> controller = FeedbackNeutralizer(FxLMS(8, [0.0, 1.0], step_size=0.01), feedback)
-    >>> result = simulate(controller, x, feedback_path=feedback, **plant)
+    >>> paths = {"secondary": [0.0, 1.0], "primary": [0.0, 0.0, 0.0, 1.0]}
+    >>> plant = Plant(**paths, feedback=[0.0, 0.9, -0.5], fs=16000)
+    >>> free = simulate(fx_lms(8, plant, step_size=0.01), x, Plant(**paths, fs=16000))
+    >>> result = simulate(FeedbackNeutralizer(fx_lms(8, plant, step_size=0.01), plant), x, plant)
     >>> bool(np.allclose(result.error, free.error))
     True
     """
 
-    def __init__(self, controller: Controller, feedback_path: PathModels, *, amplifier: Amplifiers = None) -> None:
+    def __init__(self, controller: Controller, feedback: Secondary, *, amplifier: Amplifiers = None) -> None:
         super().__init__(controller, "with feedback neutralisation")
-        self._several = is_path_matrix(feedback_path)
-        paths, self._path_fs = feedback_paths(feedback_path, self._several)
-        self._require_fitting_controller(paths)
-        self._n_taps = paths.shape[2]
-        self._sound = PlayedSound(paths[..., 1:], amplifier)  # of the samples before the newest reference
-
-    def _require_fitting_controller(self, paths: np.ndarray) -> None:
-        """Raise ValueError if the controller states numbers of channels that differ from those of the paths."""
-        if not self._several and getattr(self.controller, "multichannel", False):
-            raise ValueError("feedback_path must be (I references, J loudspeakers, taps) for this controller, got taps")
-        if self._several and not getattr(self.controller, "multichannel", True):
-            raise ValueError("feedback_path must be (taps,) for a controller of one channel")
-        for name, own in differing_counts(self.controller, n_references=len(paths), n_loudspeakers=paths.shape[1]):
+        path_fs: float | None
+        if isinstance(feedback, Plant):
+            feedback.require_constant("FeedbackNeutralizer")
+            if feedback.feedback is None:
+                raise ValueError("feedback must be a plant with a feedback path, got one without")
+            paths, path_fs = feedback.feedback, feedback.fs
+        else:
+            paths, path_fs = feedback_paths(feedback)
+        for name, own in differing_counts(controller, n_references=len(paths), n_loudspeakers=paths.shape[1]):
             raise ValueError(
-                f"feedback_path must be (I references, J loudspeakers, taps) with the controller's {name} of {own}, "
+                f"feedback must be (I references, J loudspeakers, taps) with the controller's {name} of {own}, "
                 f"got {paths.shape}"
             )
+        self._n_taps, self._path_fs = paths.shape[2], path_fs
+        self._several: bool = getattr(controller, "multichannel", max(paths.shape[:2]) > 1)
+        self._sound = PlayedSound(paths[..., 1:], amplifier)  # of the samples before the newest reference
 
     def __repr__(self) -> str:
         return f"<{self.name}: {self._n_taps} taps, {self.controller!r}>"
 
     def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
         """Return the control signal y(n), or (J,), for the newest sample x(n), or (I,), of the reference microphones."""
-        if self._several:
-            x = channel_sample(reference, self._sound.n_outputs, "reference", "references")
-            y = self.controller.control_signal(x - self._sound.output())
-        else:
-            y = self.controller.control_signal(as_number(reference, "reference") - float(self._sound.output()[0]))
+        x = channel_sample(reference, self._sound.n_outputs, "reference", "references") - self._sound.output()
+        y = self.controller.control_signal(x if self._several else float(x[0]))
         self._sound.play(y)
         return y
 

@@ -6,13 +6,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import irfft, next_fast_len, rfft
 
-from .._types import NumberOrArray, PathModels
+from .._types import NumberOrArray, Secondary
 from .._validate import as_choice, as_count, as_positive
 from ..checkpoint import Checkpointed
 from ..core.block import LOUDEST, LOUDEST_LEARNT
 from .base import as_forgetting, calls_of, require_rates
 from .channel_samples import require_moderate
 from .channels import Channels
+from .making import controller_maker
 from .processing import BlockProcessing, checked_block
 
 RIDGE = 0.01  # of the mean power of all bins, added to that of each: the noise may leave bins empty
@@ -28,123 +29,28 @@ ROUNDING = 1e-12  # -120 dB; rounding errors are at -300 dB
 TINY = float(np.finfo(float).tiny)
 
 
-class FrequencyDomainFxLMS(Channels, BlockProcessing, Checkpointed):
-    r"""FxLMS that adapts once per block of B samples, by Fourier transforms: cheap with many taps.
-
-    The control filter is kept as spectra of P partitions with N taps each, and blocks are filtered by overlap-save with
-    transforms of N + B samples. The control signal has no delay: what the samples before the block contribute to it is
-    computed when the block begins, and what the block's own samples contribute takes B multiplications per sample,
-
-    .. math:: y(n_0 + i) = \sum_{l=0}^{i} w_l\, x(n_0 + i - l) + \sum_{l>i} w_l\, x(n_0 + i - l)
-
-    With :math:`X'_p` the spectrum of the filtered reference that partition p of the control filter sees, and E that of
-    the block's errors after zeros,
-
-    .. math::
-
-       W_p \leftarrow W_p + \mu\, C\big\{M\, C\{M^* X_p'^* E\}\big\},
-
-       |M|^2 = \frac{1}{\Lambda}
-
-    C is the gradient constraint: in the time domain, the taps beyond the partition are set to zero. M is causal, the
-    minimum-phase factor of the step. With it, all bins converge at about the same rate, whatever the colour of the
-    noise, and the weights settle at the best causal filter; a step :math:`1/\Lambda` applied at once would also weight
-    what no causal filter can cancel. Without M this is exactly the block LMS, :math:`w \leftarrow w + \mu \sum_n e(n)\,
-    x'(n)`.
-
-    :math:`\Lambda` is the power of the filtered reference as the N taps of a partition see it. Their spectra are
-    coarser than the transform's: a tone in the middle of a bin has no power in the next one, but a filter that cancels
-    it has. So the mean power :math:`\overline{|X'|^2}` of a bin is spread over the others,
-
-    .. math::
-
-       \Lambda_k = P g \Big(\frac{11}{12}\, \overline{|X'_k|^2} +
-       \sum_{j \ne 0} \frac{\overline{|X'_{k-j}|^2}}{4 \pi^2 j^2} + \text{ridge}\Big)
-
-    The factor g is 1 in steady noise. It
-    raises a mean that lags behind: to the power that the newest references will have behind the secondary path, and in
-    a quiet passage to a thousandth of the usual power.
-
-    Parameters
-    ----------
-    n_taps, secondary_path, n_references
-        As for `FxLMS`.
-    step_size : float
-        Step size mu, above zero; below 1 unless `forgetting` is None.
-    block_size : int
-        Samples B of a block. The weights follow a change no sooner than at the end of a block.
-    partition_size : int, optional
-        Taps N of a partition, a multiple of B; by default B. With at least `n_taps`, there is one partition. The result
-        of the block LMS does not depend on this size.
-    constrained : bool, default True
-        False leaves out C except in the first partition, where the delayless control signal needs it. This saves most
-        of the transforms. But each partition then also has taps that repeat those of its neighbours (`weights` leaves
-        them out) and vary within a block, so the secondary path must be much shorter than a block, and the weights
-        settle only near the best filter.
-    forgetting : float or None, default 0.9
-        Forgetting factor, per block, of the mean powers. None gives the block LMS, without M.
-
-    Attributes
-    ----------
-    n_partitions : int
-        Number of partitions P.
-
-    Raises
-    ------
-    ValueError
-        A step size that is not positive and finite; sizes below 1; a partition size that is not a multiple of the block
-        size; without the constraint, `n_taps` that is not a multiple of the partition size; a path that is all zeros
-        or not FIR.
-
-    Notes
-    -----
-    A block takes some ``4 P`` transforms of ``N + B`` samples with the constraint, and a fixed number without. If the
-    secondary path is longer than a block, the step size must be smaller. For a limiter, wrap it in a
-    `LimitedController`. References above 1e20 and errors above 1e100 are refused.
-
-    A reference sample that is more than 40 dB above the usual level sets the weights to zero, unless `forgetting` is
-    None: the noise has just begun. What was learned in the near silence before it was the noise of the microphones, and
-    the control signal would now be louder than this noise by as much.
-
-    References
-    ----------
-    J. J. Shynk, "Frequency-domain and multirate adaptive filtering", IEEE Signal Processing Magazine 9(1), 1992. F.
-    Yang, Y. Cao, M. Wu, F. Albu, J. Yang, "Frequency-domain filtered-x LMS algorithms for active noise control: a
-    review and new insights", Applied Sciences 8(11), 2018. The spectral factors of the step: S. J. Elliott, B. Rafaely,
-    "Frequency-domain adaptation of causal digital filters", IEEE Trans. Signal Processing 48(5), 2000.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kfopc_filterpy import FrequencyDomainFxLMS, noise_reduction_db, simulate
-    >>> x = np.random.default_rng(0).standard_normal(16000)
-    >>> controller = FrequencyDomainFxLMS(64, [0.0, 1.0], step_size=0.2, block_size=32)
-    >>> result = simulate(controller, x, primary_path=[0.0, 0.0, 0.8, 0.4], secondary_path=[0.0, 1.0])
-    >>> bool(noise_reduction_db(result.error, result.disturbance) > 60)
-    True
-    >>> controller.weights[:3].round(6)
-    array([0. , 0.8, 0.4])
-    """
+class FrequencyDomainController(Channels, BlockProcessing, Checkpointed):
+    """Frequency-domain FxLMS: a controller that keeps its control filter for a block; see `frequency_domain_fx_lms`."""
 
     name = "frequency-domain FxLMS"
 
     def __init__(
         self,
         n_taps: int,
-        secondary_path: PathModels,
+        secondary: Secondary,
         *,
         step_size: float,
         block_size: int,
-        partition_size: int | None = None,
-        constrained: bool = True,
-        forgetting: float | None = 0.9,
-        n_references: int | None = 1,
+        partition_size: int | None,
+        constrained: bool,
+        forgetting: float | None,
+        n_references: int,
     ) -> None:
         self.step_size = as_positive(step_size, "step_size")
         self.forgetting = None if forgetting is None else as_forgetting(forgetting)
         self.constrained = as_choice(constrained, "constrained", (True, False))
         self.n_taps = as_count(n_taps, "n_taps")
-        path = self._read_paths(secondary_path, n_references, None)
+        path = self._read_paths(secondary, n_references)
         B = self.block_size = as_count(block_size, "block_size")
         N = self.partition_size = B if partition_size is None else as_count(partition_size, "partition_size")
         if N % B:
@@ -180,7 +86,7 @@ class FrequencyDomainFxLMS(Channels, BlockProcessing, Checkpointed):
     def _take_path(self, path: np.ndarray) -> None:
         self._path = path
         self._window = next_fast_len(self._size + path.shape[-1] - 1, real=True)
-        paths = path.reshape(self.n_microphones, self.n_loudspeakers, 1, -1)
+        paths = path[:, :, np.newaxis]
         self._S = rfft(paths, self._window)
         # The gain in each bin, summed over all paths: bins are samples of a spectrum, so a longer path is folded.
         folded = np.pad(paths, [(0, 0)] * 3 + [(0, -path.shape[-1] % self._size)])
@@ -188,17 +94,17 @@ class FrequencyDomainFxLMS(Channels, BlockProcessing, Checkpointed):
         self._path_gain = np.sum(np.abs(rfft(folded)) ** 2, axis=(0, 1, 2))
 
     @property
-    def secondary_path(self) -> np.ndarray:
+    def secondary(self) -> np.ndarray:
         """Estimated secondary path s^, (n_path,), or with several channels (K, J, n_path); a copy.
 
         A new estimate can be assigned between two samples: taps or an FIR system, with several channels as many paths
         as before, and no longer than the present estimate. The stored references are filtered again with it; the
         weights stay.
         """
-        return self._path.copy()
+        return (self._path if self.multichannel else self._path[0, 0]).copy()
 
-    @secondary_path.setter
-    def secondary_path(self, path: PathModels) -> None:
+    @secondary.setter
+    def secondary(self, path: Secondary) -> None:
         self._take_path(self._checked_estimate(path, self._path.shape))
         for back in range(self._X_filtered.shape[-2]):
             self._X_filtered[..., back, :] = self._filtered_spectrum(back)
@@ -409,10 +315,129 @@ class FrequencyDomainFxLMS(Channels, BlockProcessing, Checkpointed):
         return f"<{self.name}: {self.n_taps} taps in {parts}, blocks of {self.block_size} samples>"
 
 
+@controller_maker
+def frequency_domain_fx_lms(
+    n_taps: int,
+    secondary: Secondary,
+    *,
+    step_size: float,
+    block_size: int,
+    partition_size: int | None = None,
+    constrained: bool = True,
+    forgetting: float | None = 0.9,
+    n_references: int = 1,
+) -> FrequencyDomainController:
+    r"""Return FxLMS that adapts once per block of B samples, by Fourier transforms: cheap with many taps.
+
+    The control filter is kept as spectra of P partitions with N taps each, and blocks are filtered by overlap-save with
+    transforms of N + B samples. The control signal has no delay: what the samples before the block contribute to it is
+    computed when the block begins, and what the block's own samples contribute takes B multiplications per sample,
+
+    .. math:: y(n_0 + i) = \sum_{l=0}^{i} w_l\, x(n_0 + i - l) + \sum_{l>i} w_l\, x(n_0 + i - l)
+
+    With :math:`X'_p` the spectrum of the filtered reference that partition p of the control filter sees, and E that of
+    the block's errors after zeros,
+
+    .. math::
+
+       W_p \leftarrow W_p + \mu\, C\big\{M\, C\{M^* X_p'^* E\}\big\},
+
+       |M|^2 = \frac{1}{\Lambda}
+
+    C is the gradient constraint: in the time domain, the taps beyond the partition are set to zero. M is causal, the
+    minimum-phase factor of the step. With it, all bins converge at about the same rate, whatever the colour of the
+    noise, and the weights settle at the best causal filter; a step :math:`1/\Lambda` applied at once would also weight
+    what no causal filter can cancel. Without M this is exactly the block LMS, :math:`w \leftarrow w + \mu \sum_n e(n)\,
+    x'(n)`.
+
+    :math:`\Lambda` is the power of the filtered reference as the N taps of a partition see it. Their spectra are
+    coarser than the transform's: a tone in the middle of a bin has no power in the next one, but a filter that cancels
+    it has. So the mean power :math:`\overline{|X'|^2}` of a bin is spread over the others,
+
+    .. math::
+
+       \Lambda_k = P g \Big(\frac{11}{12}\, \overline{|X'_k|^2} +
+       \sum_{j \ne 0} \frac{\overline{|X'_{k-j}|^2}}{4 \pi^2 j^2} + \text{ridge}\Big)
+
+    The factor g is 1 in steady noise. It
+    raises a mean that lags behind: to the power that the newest references will have behind the secondary path, and in
+    a quiet passage to a thousandth of the usual power.
+
+    Parameters
+    ----------
+    n_taps, secondary, n_references
+        As for `fx_lms`.
+    step_size : float
+        Step size mu, above zero; below 1 unless `forgetting` is None.
+    block_size : int
+        Samples B of a block. The weights follow a change no sooner than at the end of a block.
+    partition_size : int, optional
+        Taps N of a partition, a multiple of B; by default B. With at least `n_taps`, there is one partition. The result
+        of the block LMS does not depend on this size.
+    constrained : bool, default True
+        False leaves out C except in the first partition, where the delayless control signal needs it. This saves most
+        of the transforms. But each partition then also has taps that repeat those of its neighbours (`weights` leaves
+        them out) and vary within a block, so the secondary path must be much shorter than a block, and the weights
+        settle only near the best filter.
+    forgetting : float or None, default 0.9
+        Forgetting factor, per block, of the mean powers. None gives the block LMS, without M.
+
+    Returns
+    -------
+    Controller
+        A controller named frequency-domain FxLMS; it tells its number of partitions P as `n_partitions`.
+
+    Raises
+    ------
+    ValueError
+        A step size that is not positive and finite; sizes below 1; a partition size that is not a multiple of the block
+        size; without the constraint, `n_taps` that is not a multiple of the partition size; a path that is all zeros
+        or not FIR.
+
+    Notes
+    -----
+    A block takes some ``4 P`` transforms of ``N + B`` samples with the constraint, and a fixed number without. If the
+    secondary path is longer than a block, the step size must be smaller. For a limiter, wrap it in a
+    `LimitedController`. References above 1e20 and errors above 1e100 are refused.
+
+    A reference sample that is more than 40 dB above the usual level sets the weights to zero, unless `forgetting` is
+    None: the noise has just begun. What was learned in the near silence before it was the noise of the microphones, and
+    the control signal would now be louder than this noise by as much.
+
+    References
+    ----------
+    J. J. Shynk, "Frequency-domain and multirate adaptive filtering", IEEE Signal Processing Magazine 9(1), 1992. F.
+    Yang, Y. Cao, M. Wu, F. Albu, J. Yang, "Frequency-domain filtered-x LMS algorithms for active noise control: a
+    review and new insights", Applied Sciences 8(11), 2018. The spectral factors of the step: S. J. Elliott, B. Rafaely,
+    "Frequency-domain adaptation of causal digital filters", IEEE Trans. Signal Processing 48(5), 2000.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import Plant, frequency_domain_fx_lms, simulate
+    >>> plant = Plant([0.0, 1.0], [0.0, 0.0, 0.8, 0.4], fs=16000)
+    >>> controller = frequency_domain_fx_lms(64, plant, step_size=0.2, block_size=32)
+    >>> simulate(controller, np.random.default_rng(0).standard_normal(16000), plant).noise_reduction_db > 60
+    True
+    >>> controller.weights[:3].round(6)
+    array([0. , 0.8, 0.4])
+    """
+    return FrequencyDomainController(
+        n_taps,
+        secondary,
+        step_size=step_size,
+        block_size=block_size,
+        partition_size=partition_size,
+        constrained=constrained,
+        forgetting=forgetting,
+        n_references=n_references,
+    )
+
+
 def runs_in_blocks(controller: object) -> bool:
     """Return whether a controller keeps its control filter for a block, and no subclass changes what a sample does."""
     kind = type(controller)
-    return isinstance(controller, FrequencyDomainFxLMS) and calls_of(kind) == calls_of(FrequencyDomainFxLMS)
+    return isinstance(controller, FrequencyDomainController) and calls_of(kind) == calls_of(FrequencyDomainController)
 
 
 def minimum_phase(magnitude: np.ndarray, size: int) -> np.ndarray:

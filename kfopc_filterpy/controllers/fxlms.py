@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from .._types import PathModels
+from .._types import Secondary
 from ..power.limiter import Limiters
-from .core_controller import CoreController, setting
+from .core_controller import CoreController
+from .making import controller_maker
 
 
-class FxLMS(CoreController):
-    r"""Filtered-reference LMS, :math:`w(n+1) = w(n) + \mu e(n) x'(n)`, without a constraint.
+@controller_maker
+def fx_lms(
+    n_taps: int,
+    secondary: Secondary,
+    *,
+    step_size: float,
+    n_references: int = 1,
+    limiter: Limiters = None,
+) -> CoreController:
+    r"""Return FxLMS, filtered-reference LMS: :math:`w(n+1) = w(n) + \mu e(n) x'(n)`, without a constraint.
 
     With K microphones, J loudspeakers and I references it is the multiple-error LMS (MEFxLMS), which descends the
     gradient of the sum of the squared errors:
@@ -23,9 +32,9 @@ class FxLMS(CoreController):
     ----------
     n_taps : int
         Taps L of the control filter, or of each of them.
-    secondary_path : array_like, shape (taps,) or (K, J, taps), or control system
-        Estimated secondary path, taps or an FIR system. With channel axes, those from loudspeaker j to microphone k; a
-        system of several inputs and outputs, or a nested sequence of systems, is taken likewise.
+    secondary : array_like, shape (n_taps,) or (K, J, n_taps), control system, Recording or Plant
+        Estimated secondary path, or those from loudspeaker j to microphone k: taps, an FIR system, nested lists of
+        systems, or those of a plant.
     step_size : float
         Step size mu, above zero.
     n_references : int, default 1
@@ -33,6 +42,11 @@ class FxLMS(CoreController):
     limiter : OutputLimiter or sequence of J of them, optional
         Limiter of the control signal, or one for each loudspeaker, not shared with another controller. FxLMS adapts to
         the error alone: while the limiter acts, the error does not fall and the weights grow.
+
+    Returns
+    -------
+    CoreController
+        A controller named FxLMS.
 
     Raises
     ------
@@ -55,8 +69,8 @@ class FxLMS(CoreController):
 
     Examples
     --------
-    >>> from kfopc_filterpy import FxLMS
-    >>> controller = FxLMS(4, secondary_path=[1.0], step_size=0.1)
+    >>> from kfopc_filterpy import fx_lms
+    >>> controller = fx_lms(4, [1.0], step_size=0.1)
     >>> controller.control_signal(1.0)
     0.0
     >>> controller.update(2.0)  # e = d: nothing is cancelled yet
@@ -65,7 +79,7 @@ class FxLMS(CoreController):
 
     Two loudspeakers and one microphone, which hears the second one half as loud:
 
-    >>> two = FxLMS(4, secondary_path=[[[1.0, 0.0], [0.5, 0.0]]], step_size=0.1)
+    >>> two = fx_lms(4, [[[1.0, 0.0], [0.5, 0.0]]], step_size=0.1)
     >>> two.control_signal([1.0])
     array([0., 0.])
     >>> two.update([2.0])
@@ -74,19 +88,12 @@ class FxLMS(CoreController):
     >>> two.weights[:, 0, 0]  # 0.1 * 2 * 1 and 0.1 * 2 * 0.5
     array([0.2, 0.1])
     """
-
-    name = "FxLMS"
-    algorithm = "fxlms"
-    step_size = setting("Step size mu.")
-
-    def __init__(
-        self,
-        n_taps: int,
-        secondary_path: PathModels,
-        *,
-        step_size: float,
-        n_references: int = 1,
-        limiter: Limiters = None,
-    ) -> None:
-        settings = {"step_size": step_size}
-        super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
+    return CoreController(
+        "FxLMS",
+        "fxlms",
+        n_taps,
+        secondary,
+        settings={"step_size": step_size},
+        n_references=n_references,
+        limiter=limiter,
+    )

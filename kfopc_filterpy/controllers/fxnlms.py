@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
-from .._types import PathModels
-from .._validate import as_nonnegative, as_positive
+from .._types import Secondary
+from .._validate import as_positive
 from ..power.limiter import Limiters
-from .core_controller import CoreController, setting
+from .core_controller import CoreController
+from .making import controller_maker
 
 
-class FxNLMS(CoreController):
-    r"""Normalised FxLMS: the step is divided by the energy of the filtered reference, without a constraint.
+@controller_maker
+def fx_nlms(
+    n_taps: int,
+    secondary: Secondary,
+    *,
+    step_size: float,
+    regularization: float | None = None,
+    n_references: int = 1,
+    limiter: Limiters = None,
+) -> CoreController:
+    r"""Return fx_nlms, normalised FxLMS: the step is divided by the energy of the filtered reference.
 
     .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{x'(n)^T x'(n)}
 
@@ -25,12 +33,17 @@ class FxNLMS(CoreController):
 
     Parameters
     ----------
-    n_taps, secondary_path, n_references, limiter
-        As for `FxLMS`.
+    n_taps, secondary, n_references, limiter
+        As for `fx_lms`.
     step_size : float
         Step size mu, above zero; below 2 for secondary paths without delay, and smaller for longer paths.
     regularization : float, optional
         Energy epsilon, above zero, that is added to the energy instead; in the unit of the squared filtered reference.
+
+    Returns
+    -------
+    CoreController
+        A controller named FxNLMS.
 
     Raises
     ------
@@ -45,35 +58,21 @@ class FxNLMS(CoreController):
 
     Examples
     --------
-    >>> from kfopc_filterpy import FxNLMS
-    >>> controller = FxNLMS(4, secondary_path=[1.0], step_size=0.5)
+    >>> from kfopc_filterpy import fx_nlms
+    >>> controller = fx_nlms(4, [1.0], step_size=0.5)
     >>> controller.control_signal(2.0)
     0.0
     >>> controller.update(4.0)
     >>> float(controller.weights[0])  # 0.5 * 4 * 2 / 2^2
     1.0
     """
-
-    name = "FxNLMS"
-    algorithm = "fxnlms"
-    checks: ClassVar = {"regularization": as_nonnegative}
-    step_size = setting("Step size mu.")
-
-    def __init__(
-        self,
-        n_taps: int,
-        secondary_path: PathModels,
-        *,
-        step_size: float,
-        regularization: float | None = None,
-        n_references: int = 1,
-        limiter: Limiters = None,
-    ) -> None:
-        epsilon = 0.0 if regularization is None else as_positive(regularization, "regularization")
-        settings = {"step_size": step_size, "regularization": epsilon}
-        super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
-
-    @property
-    def regularization(self) -> float | None:
-        """Regularization epsilon, or None."""
-        return self._of_setting("regularization") or None
+    epsilon = 0.0 if regularization is None else as_positive(regularization, "regularization")
+    return CoreController(
+        "FxNLMS",
+        "fxnlms",
+        n_taps,
+        secondary,
+        settings={"step_size": step_size, "regularization": epsilon},
+        n_references=n_references,
+        limiter=limiter,
+    )

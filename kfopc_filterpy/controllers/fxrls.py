@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from .._types import PathModels
+from .._types import Secondary
 from .._validate import as_positive
-from ..paths.path_matrix import is_path_matrix
 from ..power.amplifiers import Amplifier
 from ..power.limiter import OutputLimiter
 from .base import as_forgetting
-from .direct import DirectKalman
+from .kalman import KalmanInCore, kalman_settings
+from .making import controller_maker
 
 
+@controller_maker
 def fx_rls(
     n_taps: int,
-    secondary_path: PathModels,
+    secondary: Secondary,
     *,
     forgetting: float = 0.9999,
     initial_variance: float = 1.0,
     amplifier: Amplifier | None = None,
     limiter: OutputLimiter | None = None,
-) -> DirectKalman:
+) -> KalmanInCore:
     r"""Return FxRLS, which minimises :math:`\sum_k \lambda^{n-k} (\hat d(k) - w^T x'(k))^2` without a constraint.
 
     .. math::
@@ -35,7 +36,7 @@ def fx_rls(
 
     Parameters
     ----------
-    n_taps, secondary_path, amplifier, limiter
+    n_taps, secondary, amplifier, limiter
         As for `kf_anc`.
     forgetting : float, default 0.9999
         Forgetting factor lambda, above 0 and at most 1; the memory is about 1/(1 - lambda) samples.
@@ -44,7 +45,7 @@ def fx_rls(
 
     Returns
     -------
-    DirectKalman
+    CoreController
         A controller named FxRLS.
 
     Raises
@@ -76,20 +77,18 @@ def fx_rls(
     >>> round(float(controller.weights[0]), 6)  # K = 1 / (0.5 + 1)
     2.0
     """
-    if is_path_matrix(secondary_path):
-        raise ValueError(
-            "fx_rls takes one channel, because with several every microphone would need a covariance of its own: use "
-            "kf_pb, which makes one least-squares estimate for all microphones, or an LMS algorithm such as FxNLMS"
-        )
-    forgetting = as_forgetting(forgetting)
-    return DirectKalman(
+    return KalmanInCore(
+        "FxRLS",
+        "kalman",
         n_taps,
-        secondary_path,
-        state_noise=0.0,
-        measurement_noise=1.0,
-        initial_variance=as_positive(initial_variance, "initial_variance"),
-        fading=1.0 / forgetting,
+        secondary,
+        settings=kalman_settings(
+            state_noise=0.0,
+            measurement_noise=1.0,
+            initial_variance=as_positive(initial_variance, "initial_variance"),
+            fading=1.0 / as_forgetting(forgetting),
+        ),
+        n_references=None,  # with several channels every microphone would need a covariance of its own
         amplifier=amplifier,
         limiter=limiter,
-        name="FxRLS",
     )

@@ -66,14 +66,13 @@ def with_internal_model(controller: _Made) -> _Made:
     --------
     A tone can be predicted, so no reference microphone is needed:
 
-    >>> from kfopc_filterpy import kf_opc, noise_reduction_db, simulate
+    >>> from kfopc_filterpy import Plant, kf_opc, simulate
     >>> from kfopc_filterpy.controllers import with_internal_model
     >>> from kfopc_filterpy.signals import tone
-    >>> path = [0.0, 0.0, 0.8]
-    >>> plain = kf_opc(16, path, rated_power=1.0, state_noise=1e-6, measurement_noise=1e-3)
+    >>> plant = Plant([0.0, 0.0, 0.8], fs=16000)
+    >>> plain = kf_opc(16, plant, rated_power=1.0, state_noise=1e-6, measurement_noise=1e-3)
     >>> controller = with_internal_model(plain)
-    >>> result = simulate(controller, None, disturbance=tone(400.0, 1.0, fs=16000), secondary_path=path)
-    >>> bool(noise_reduction_db(result.error, result.disturbance) > 20)
+    >>> simulate(controller, None, plant, disturbance=tone(400.0, 1.0, fs=16000)).noise_reduction_db > 20
     True
     """
     if not isinstance(controller, CoreController):

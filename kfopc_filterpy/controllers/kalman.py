@@ -1,225 +1,124 @@
-"""The Kalman filter as the adaptation of the control filter: KF-ANC and KF-OPC, and any filterpy filter."""
+"""KF-ANC (eq. 2-8) and KF-OPC (eq. 9-13) for any number of channels: all weights as one state."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
-from numpy.typing import ArrayLike
 
-from .._types import PathModels, PerLoudspeaker, PerMicrophone
-from ..bounds.settings import SuggestedSettings
-from ..filters.kfopc import KFOPC
-from ..power.amplifiers import Amplifier, Amplifiers
-from ..power.constraint import DEFAULT_FS, Constraints, OutputPowerConstraint
-from ..power.limiter import Limiters, OutputLimiter
-from .base import constraint_for
+from .._types import NumberOrArray, PerLoudspeaker, PerMicrophone, Secondary
+from ..core.triangle import OWED, full_covariance
+from ..power.amplifiers import Amplifiers
+from ..power.constraint import Constraints
+from ..power.limiter import Limiters
 from .core_controller import CoreController
-from .direct import DirectKalman
-
-_Made = TypeVar("_Made", bound=CoreController)
+from .making import controller_maker, require_rated_power
 
 
-class KalmanController(CoreController):
-    """The modified ANC structure around a filterpy filter: any `KalmanFilter` of one measurement.
-
-    In each sample, the estimator gets the disturbance estimate as z and the filtered reference as H. With a rated
-    power this is KF-OPC, without one KF-ANC. `kf_anc` and `kf_opc` return the same in C, which is much faster.
-
-    Parameters
-    ----------
-    estimator : filterpy.kalman.KalmanFilter
-        Filter whose state is the control filter, ``dim_z = 1``; a `KFOPC`, or filterpy's own.
-    secondary_path : array_like or control.TransferFunction
-        Estimated secondary path, taps or an FIR system.
-    amplifier : callable, optional
-        Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
-    name : str, optional
-        Name in results and legends; by default KF-OPC with a rated power, else KF-ANC.
-    limiter : OutputLimiter, optional
-        Limiter of the control signal, not shared with another controller. No window of the control signal then exceeds
-        the limiter's rated power.
-
-    Raises
-    ------
-    TypeError
-        An estimator that is not a filterpy KalmanFilter.
-    ValueError
-        An estimator of several measurements.
-
-    Examples
-    --------
-    >>> from filterpy.kalman import KalmanFilter
-    >>> from kfopc_filterpy import KalmanController
-    >>> controller = KalmanController(KalmanFilter(dim_x=4, dim_z=1), secondary_path=[1.0])
-    >>> controller.control_signal(1.0)
-    0.0
-    >>> controller.update(2.0)
-    >>> float(controller.weights[0])  # K z = P / (P + R) z with P = I + Q = 2, R = 1
-    1.3333333333333333
-    """
-
-    algorithm = "signals_alone"
-    takes_guard = False  # the estimator gets one measurement in a sample
-
-    def __init__(
-        self,
-        estimator: KalmanFilter,
-        secondary_path: PathModels,
-        *,
-        amplifier: Amplifier | None = None,
-        name: str | None = None,
-        limiter: OutputLimiter | None = None,
-    ) -> None:
-        if not isinstance(estimator, KalmanFilter):
-            raise TypeError(f"estimator must be a filterpy KalmanFilter, got {type(estimator).__name__}")
-        if estimator.dim_z != 1:
-            raise ValueError(
-                f"estimator must have one measurement, dim_z = 1, got dim_z = {estimator.dim_z}; "
-                "kf_anc and kf_opc take several microphones"
-            )
-        self.estimator = estimator
-        super().__init__(
-            estimator.dim_x, secondary_path, settings={}, n_references=None, amplifier=amplifier, limiter=limiter
-        )
-        self.name = name or ("KF-ANC" if self.rated_power is None else "KF-OPC")
-
-    def _read_rated_power(self) -> float | None:
-        return getattr(self.estimator, "rated_power", None)
-
-    def _take_rated_power(self, value: float) -> None:
-        self.estimator.rated_power = value
+class KalmanInCore(CoreController):
+    """KF-ANC, KF-OPC and FxRLS: what can be read of their state, and assigned."""
 
     @property
-    def weights(self) -> np.ndarray:
-        """Estimator's state w, (L,); a copy."""
-        return np.array(self.estimator.x, dtype=np.float64).reshape(-1)
+    def state_noise(self) -> float:
+        """State noise variance r; can be assigned."""
+        return self._of_setting("state_noise")
+
+    @state_noise.setter
+    def state_noise(self, value: float) -> None:
+        self._take_setting("state_noise", value)
 
     @property
-    def constraint(self) -> OutputPowerConstraint:
-        """Constraint of the estimator, or else one that computes the powers, its factor fixed at the estimator's."""
-        theirs = self.estimator.constraint if isinstance(self.estimator, KFOPC) else None
-        if theirs is not None:
-            return theirs
-        if self._own_constraint.factor != self.constraint_factor:
-            self._own_constraint.factor = self.constraint_factor
-        return self._own_constraint
+    def measurement_noise(self) -> NumberOrArray:
+        """Measurement noise variance q, or with several channels that of each microphone, (K,); can be assigned."""
+        return self._of_setting("measurement_noise")
+
+    @measurement_noise.setter
+    def measurement_noise(self, value: PerMicrophone) -> None:
+        self._take_setting("measurement_noise", value)
 
     @property
-    def constraint_factor(self) -> float:
-        """Constraint factor of the last sample."""
-        return getattr(self.estimator, "constraint_factor", 1.0)
+    def innovation(self) -> NumberOrArray:
+        """Innovation alpha d^ - w'x' of the last update; with several channels that of each microphone, (K,).
+
+        The microphones are measured one after the other, each with the weights that those before it have corrected.
+        """
+        return self._number_of_each("innovation")
+
+    @property
+    def innovation_variance(self) -> NumberOrArray:
+        """Predicted variance S of that innovation (eq. 7), 0 before the first sample; with several channels (K,)."""
+        return self._number_of_each("innovation_variance")
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """State covariance P, (J I L, J I L), in the order of ``weights.ravel()``; a new array."""
+        fields = {name: self._block.fields[name].ravel() for name in ("owed", "triangle", "gain_direction")}
+        scale, diagonal, pending, *_ = fields["owed"].view(OWED).item()
+        direction = fields["gain_direction"][: self._by_channel("weights").size]
+        return full_covariance(fields["triangle"], direction, scale, diagonal, -scale * pending)
 
     def _after_new_path(self, before: np.ndarray) -> None:
-        """Let P grow by the variance that the new path gives to the weights."""
-        variance = self._variance_by_new_path(before)
-        if variance > 0.0:
-            self.estimator.P = self.estimator.P + variance * np.eye(self.n_taps)
-
-    def control_signal(self, reference: float | None) -> float:
-        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
-        weights = self._by_channel("weights")
-        before = weights.copy()
-        weights[:] = np.reshape(self.estimator.x, -1)
-        try:
-            return super().control_signal(reference)
-        except BaseException:
-            weights[:] = before
-            raise
-
-    def update(self, error: float) -> None:
-        """Let the estimator predict and update (eq. 2-9) with the error e(n) that the last control signal left."""
-        super().update(error)
-        block, estimator = self._block, self.estimator
-        d, x = float(block.fields["disturbance"].item()), float(block.latest("reference").flat[0])
-        h, powers = block.latest("filtered_reference").reshape(1, -1)[:, : self.n_taps].copy(), self.constraint
-        before = estimator.__dict__.copy()  # predictions write into no array
-        try:
-            estimator.predict()
-            if isinstance(estimator, KFOPC):
-                estimator.update(d, H=h, reference=x)
-            else:
-                estimator.update(np.full((1,) * np.ndim(estimator.x), d), H=h)
-        except BaseException:  # the prediction must not stay
-            estimator.__dict__.clear()
-            estimator.__dict__.update(before)
-            raise
-        if powers is self._own_constraint:
-            powers.advance(d, h[0, 0], x)
-
-    def process(
-        self,
-        references: ArrayLike | None,
-        errors: ArrayLike,
-        *,
-        adapt: bool | ArrayLike = True,
-        out: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Process a block, see `BlockProcessing.process`; to the estimator, a sample that is not adapted to is missed."""
-        y = super().process(references, errors, adapt=adapt, out=out)
-        if not np.ravel(adapt)[-1]:
-            self.estimator.update(None)
-        return y
-
-    def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
-        if self.constraint is self._own_constraint:
-            return super()._listen(references, errors, adapting)
-        block = self._block
-        for n, e in enumerate(errors):
-            taken = super()._listen(references[n : n + 1], errors[n : n + 1], adapting[n : n + 1])
-            if not taken:
-                return n
-            if adapting[n]:
-                filtered = float(block.latest("filtered_reference").flat[0])
-                reference = float(block.latest("reference").flat[0])
-                self.constraint.advance(float(e), filtered, reference)  # silent: d^ = e
-        return len(references)
+        """Let P grow by the variance that the new paths give to the weights."""
+        self._block.fields["owed"].ravel().view(OWED)["diagonal"] += self._variance_by_new_path(before)
 
 
+@controller_maker
 def kf_anc(
-    n_taps: int | SuggestedSettings,
-    secondary_path: PathModels,
+    n_taps: int,
+    secondary: Secondary,
     *,
-    state_noise: float | None = None,
-    measurement_noise: PerMicrophone | None = None,
-    initial_variance: float | None = None,
+    state_noise: float,
+    measurement_noise: PerMicrophone,
+    initial_variance: float = 1.0,
     n_references: int = 1,
     amplifier: Amplifiers = None,
     limiter: Limiters = None,
-) -> DirectKalman:
+) -> KalmanInCore:
     """Return KF-ANC, the Kalman filter of eq. 2-8 without a constraint.
+
+    The state has the control filters of all loudspeakers for all references, (J, I, L), and the filtered references of a
+    microphone are its observation row. The K measurements of a sample have independent noises, so they correct the
+    weights one after the other, in O(K (J I L)^2) operations.
 
     Parameters
     ----------
-    n_taps : int or SuggestedSettings
-        Taps L of the control filter, or of each of them. Or pass the result of `suggest_settings`, which also supplies
-        the defaults of the next three settings.
-    secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
+    n_taps : int
+        Taps L of the control filter, or of each of them.
+    secondary : array_like, shape (n_path,) or (K, J, n_path), control system, Recording or Plant
         Estimated secondary path, or those from J loudspeakers to K microphones.
-    state_noise : float, optional
-        r, see `KFOPC.random_walk`; by default the suggested one.
-    measurement_noise : float or array_like, shape (K,), optional
-        q of all microphones, or of each; by default the suggested one.
-    initial_variance : float, optional
-        P(0|0) of each tap; by default the suggested one, or 1. It has the unit of a squared weight, so 1 may be far too
-        much.
+    state_noise : float
+        State noise variance r (eq. 4), zero or above.
+    measurement_noise : float or array_like, shape (K,)
+        Measurement noise variance q (eq. 7) of all microphones or of each, zero or above. The larger its q, the less a
+        microphone counts.
+    initial_variance : float, default 1
+        P(0|0) of each tap. It has the unit of a squared weight, so 1 may be far too much; `suggest_settings` computes
+        the three from a silent run.
     n_references : int, default 1
         Number of references I.
-    amplifier, limiter : optional
-        See `DirectKalman`.
+    amplifier : callable or sequence of J of them, optional
+        Known amplifier model: the disturbance is then estimated with s^ * amplifier(y), not s^ * y as published.
+    limiter : OutputLimiter or sequence of J of them, optional
+        Limiter of the control signal, or one for each loudspeaker, not shared with another controller.
 
     Returns
     -------
-    DirectKalman
+    CoreController
         A controller named KF-ANC. With several channels, its signals and weights have channel axes.
 
     Raises
     ------
     ValueError, TypeError
-        Neither suggested settings nor state noise and measurement noise; a setting that is out of range, or that does not
-        fit the number of channels; another sample rate than that of the suggested settings.
+        A setting that is out of range, or that does not fit the number of channels.
+
+    See Also
+    --------
+    KFOPC : The same equations as a filterpy filter, ``dim_z=K``.
+    KalmanController : The same structure around any filterpy filter.
+
+    Notes
+    -----
+    With ``measurement_noise=0``, a sample that carries no information, such as a silent one, corrects nothing.
 
     Examples
     --------
@@ -230,127 +129,116 @@ def kf_anc(
     With settings from a silent run:
 
     >>> import numpy as np
-    >>> from kfopc_filterpy import suggest_settings
-    >>> x = np.random.default_rng(0).standard_normal(16000)
-    >>> kf_anc(suggest_settings(x, np.roll(x, 9), [1.0]), [1.0]).n_taps
+    >>> from kfopc_filterpy import Plant, suggest_settings
+    >>> plant = Plant([1.0], np.eye(12)[9], fs=16000)
+    >>> suggested = suggest_settings(np.random.default_rng(0).standard_normal(16000), plant)
+    >>> kf_anc(suggested.n_taps, plant, **suggested.noises).n_taps
     16
     """
-    return with_suggested(
-        DirectKalman,
+    return KalmanInCore(
+        "KF-ANC",
+        "kalman",
         n_taps,
-        secondary_path,
-        {"state_noise": state_noise, "measurement_noise": measurement_noise, "initial_variance": initial_variance},
+        secondary,
+        settings=kalman_settings(state_noise, measurement_noise, initial_variance),
         n_references=n_references,
         amplifier=amplifier,
         limiter=limiter,
     )
 
 
+@controller_maker
 def kf_opc(
-    n_taps: int | SuggestedSettings,
-    secondary_path: PathModels,
+    n_taps: int,
+    secondary: Secondary,
     *,
     rated_power: PerLoudspeaker | None = None,
     constraint: Constraints = None,
-    state_noise: float | None = None,
-    measurement_noise: PerMicrophone | None = None,
-    initial_variance: float | None = None,
+    fs: float | None = None,
+    state_noise: float,
+    measurement_noise: PerMicrophone,
+    initial_variance: float = 1.0,
     n_references: int = 1,
     amplifier: Amplifiers = None,
     limiter: Limiters = None,
-    fs: float | None = None,
-) -> DirectKalman:
-    """Return KF-OPC, the Kalman filter with output power constraint (eq. 9-13).
+) -> KalmanInCore:
+    r"""Return KF-OPC, the Kalman filter with output power constraint (eq. 9-13).
+
+    KF-OPC scales all measurements by one factor. Eq. 13 gives a factor for each loudspeaker as if it were alone; the
+    smallest of them is used:
+
+    .. math::
+
+       \alpha = \min_j \min\{\sqrt{\rho_j G_j / \delta_d^2},\ 1\},
+
+       G_j = \frac{\sum_{k,i} E[x_{kji}'^2]}{\sum_i E[x_i^2]},
+
+       \delta_d^2 = \sum_k E[\hat d_k^2]
+
+    This extension is the package's, not the paper's. With one loudspeaker, microphone and reference it is eq. 13. A
+    loudspeaker that no microphone hears, :math:`G_j = 0`, is left out: its control filters stay zero.
 
     Parameters
     ----------
-    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, n_references, amplifier, limiter
+    n_taps, secondary, state_noise, measurement_noise, initial_variance, n_references, amplifier, limiter
         As for `kf_anc`.
     rated_power : float or array_like, shape (J,), optional
         Rated output power rho_o of all loudspeakers, or of each.
     constraint : OutputPowerConstraint or sequence of J of them, optional
-        Alternative to `rated_power`: a rated power with the settings of its power estimates, for example the sample
-        rate. A copy is kept.
+        Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
     fs : float, optional
-        Sample rate in Hz of the power estimates of a `rated_power`; by default that of suggested settings, or 16 kHz.
+        Sample rate in Hz of the power estimates; a system, a recording or a plant as `secondary` brings it.
 
     Returns
     -------
-    DirectKalman
-        A controller named KF-OPC. With several loudspeakers it scales all measurements by their smallest factor.
+    CoreController
+        A controller named KF-OPC. With several loudspeakers, `constraint_factor` is (J,), each loudspeaker's own factor;
+        the smallest one is applied.
 
     Raises
     ------
     ValueError, TypeError
-        Neither a rated power nor a constraint, or both; neither suggested settings nor state noise and measurement noise;
-        a setting that is out of range, or that does not fit the number of channels; another sample rate than that of the
-        suggested settings.
+        Neither a rated power nor a constraint, or both; a rated power without a sample rate; a setting that is out of
+        range, or that does not fit the number of channels.
+
+    See Also
+    --------
+    kf_pb : A filter that learns the plant, and spends the rated power where it reduces the noise most.
 
     Examples
     --------
     >>> import numpy as np
     >>> from kfopc_filterpy import kf_opc
-    >>> kf_opc(8, [1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1).rated_power
+    >>> kf_opc(8, [1.0], rated_power=0.5, fs=16000, state_noise=1e-6, measurement_noise=0.1).rated_power
     0.5
     >>> paths = np.zeros((2, 2, 8))  # two loudspeakers, two microphones
     >>> paths[:, :, 1] = [[1.0, 0.3], [0.2, 1.0]]
-    >>> kf_opc(8, paths, rated_power=[0.5, 0.2], state_noise=1e-6, measurement_noise=0.1).rated_power
-    array([0.5, 0.2])
+    >>> kf_opc(32, paths, rated_power=[0.5, 0.2], fs=16000, state_noise=1e-8, measurement_noise=0.01)
+    <KF-OPC: 2 microphones, 2 loudspeakers, 1 reference, 32 taps, rated power 0.5, 0.2, constraint factor 1, 1>
     """
-    return with_suggested(
-        DirectKalman,
+    require_rated_power(rated_power, constraint)
+    return KalmanInCore(
+        "KF-OPC",
+        "kalman",
         n_taps,
-        secondary_path,
-        {"state_noise": state_noise, "measurement_noise": measurement_noise, "initial_variance": initial_variance},
-        constraint=suggested_constraint(n_taps, rated_power, constraint, fs),
+        secondary,
+        settings=kalman_settings(state_noise, measurement_noise, initial_variance),
         n_references=n_references,
+        rated_power=rated_power,
+        constraint=constraint,
+        fs=fs,
         amplifier=amplifier,
         limiter=limiter,
     )
 
 
-def with_suggested(
-    kind: Callable[..., _Made],
-    n_taps: int | SuggestedSettings,
-    secondary_path: PathModels,
-    noises: Mapping[str, Any],
-    **others: Any,
-) -> _Made:
-    """Return a controller of a kind; suggested settings, if `n_taps` are such, replace the noises that are None."""
-    suggested: Mapping[str, Any] = {"initial_variance": 1.0}
-    taps = n_taps
-    if isinstance(n_taps, SuggestedSettings):
-        suggested, taps = n_taps.settings, n_taps.n_taps
-    settings = {**suggested, **{name: value for name, value in noises.items() if value is not None}}
-    if not {"state_noise", "measurement_noise"} <= settings.keys():
-        raise TypeError(
-            "give state_noise and measurement_noise, or pass the result of suggest_settings(reference, disturbance, "
-            "secondary_path), from a run with a silent loudspeaker, as n_taps"
-        )
-    return at_suggested_rate(kind(taps, secondary_path, **settings, **others), n_taps)
-
-
-def suggested_constraint(
-    n_taps: int | SuggestedSettings, rated_power: PerLoudspeaker | None, constraint: Constraints, fs: float | None
-) -> Any:
-    """Return `constraint_for` at a sample rate, by default that of suggested settings if `n_taps` are such."""
-    if constraint is not None and fs is not None:
-        raise ValueError("fs belongs to rated_power: a constraint has its own, OutputPowerConstraint(..., fs=...)")
-    return constraint_for(rated_power, constraint, rate_of(n_taps, fs))
-
-
-def rate_of(n_taps: int | SuggestedSettings, fs: float | None) -> float:
-    """Return a sample rate in Hz: `fs`, or else that of suggested settings given as `n_taps`, or else the default."""
-    if fs is None:
-        return n_taps.fs if isinstance(n_taps, SuggestedSettings) else DEFAULT_FS
-    return fs
-
-
-def at_suggested_rate(controller: _Made, n_taps: int | SuggestedSettings) -> _Made:
-    """Return the controller, or raise ValueError if a part of it has another sample rate than suggested settings."""
-    if isinstance(n_taps, SuggestedSettings):
-        try:
-            controller.require_sample_rate(n_taps.fs)
-        except ValueError as error:
-            raise ValueError(f"in the suggested settings, {error}") from None
-    return controller
+def kalman_settings(
+    state_noise: float, measurement_noise: PerMicrophone, initial_variance: float, fading: float = 1.0
+) -> dict[str, Any]:
+    """Return the settings of the core's Kalman filter; `fading` is the factor of P in each sample, filterpy's alpha squared."""
+    return {
+        "state_noise": state_noise,
+        "measurement_noise": measurement_noise,
+        "initial_variance": initial_variance,
+        "fading": fading,
+    }

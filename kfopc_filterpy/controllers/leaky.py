@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
-
 import numpy as np
 
-from .._types import PathModels, PerLoudspeaker
+from .._types import PerLoudspeaker, Secondary
 from .._validate import as_nonnegative
 from ..power.amplifiers import Amplifiers
 from ..power.constraint import Constraints
 from ..power.limiter import Limiters
-from .core_controller import CoreController, setting
+from .core_controller import CoreController
+from .making import controller_maker, require_rated_power
 from .mov import penalty_factor
 
 
@@ -56,8 +55,17 @@ def leak_factor(
     return as_nonnegative(reference_power, "reference_power") * gamma
 
 
-class LeakyFxLMS(CoreController):
-    r"""Leaky FxLMS, :math:`w(n+1) = (1 - \mu\gamma) w(n) + \mu e(n) x'(n)`, with a fixed leak.
+@controller_maker
+def leaky_fx_lms(
+    n_taps: int,
+    secondary: Secondary,
+    *,
+    step_size: float,
+    leak: PerLoudspeaker,
+    n_references: int = 1,
+    limiter: Limiters = None,
+) -> CoreController:
+    r"""Return leaky FxLMS, :math:`w(n+1) = (1 - \mu\gamma) w(n) + \mu e(n) x'(n)`, with a fixed leak.
 
     The weights settle at about :math:`(R_{x'} + \gamma I) w = r`, which minimises :math:`E[e^2] + \gamma w^T w`. With
     several channels this is :math:`\sum_k E[e_k^2] + \sum_j \gamma_j \sum_i w_{ji}^T w_{ji}`, and a leak also keeps
@@ -65,11 +73,16 @@ class LeakyFxLMS(CoreController):
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, n_references, limiter
-        As for `FxLMS`.
+    n_taps, secondary, step_size, n_references, limiter
+        As for `fx_lms`.
     leak : float or array_like, shape (J,)
         Leak gamma, or that of each loudspeaker, zero or above, in the unit of the squared reference; `leak_factor`
         computes it for a rated power.
+
+    Returns
+    -------
+    CoreController
+        A controller named leaky FxLMS.
 
     Raises
     ------
@@ -84,64 +97,68 @@ class LeakyFxLMS(CoreController):
 
     Examples
     --------
-    >>> from kfopc_filterpy import LeakyFxLMS
-    >>> controller = LeakyFxLMS(1, secondary_path=[1.0], step_size=0.1, leak=1.0)
+    >>> from kfopc_filterpy import leaky_fx_lms
+    >>> controller = leaky_fx_lms(1, [1.0], step_size=0.1, leak=1.0)
     >>> for _ in range(200):
     ...     error = 2.0 - controller.control_signal(1.0)
     ...     controller.update(error)
     >>> round(float(controller.weights[0]), 6)  # (1 + leak) w = 2
     1.0
     """
-
-    name = "leaky FxLMS"
-    algorithm = "leaky"
-    step_size = setting("Step size mu.")
-    leak = setting("Leak gamma; with several channels (J,), a copy.")
-    checks: ClassVar = {"leak": as_nonnegative}
-
-    def __init__(
-        self,
-        n_taps: int,
-        secondary_path: PathModels,
-        *,
-        step_size: float,
-        leak: PerLoudspeaker,
-        n_references: int = 1,
-        limiter: Limiters = None,
-    ) -> None:
-        settings = {"step_size": step_size, "leak": leak}
-        super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
-
-    def _checked_settings(self) -> dict[str, Any]:
-        settings = super()._checked_settings()
-        most = float(np.max(settings["step_size"] * settings["leak"]))
-        if most > 1.0:
-            raise ValueError(
-                f"step_size * leak must be 1 at most, got {most:g}: a sample would take more than the weight"
-            )
-        return settings
+    controller = CoreController(
+        "leaky FxLMS",
+        "leaky",
+        n_taps,
+        secondary,
+        settings={"step_size": step_size, "leak": leak},
+        n_references=n_references,
+        limiter=limiter,
+    )
+    most = float(np.max(controller.step_size * controller.leak))
+    if most > 1.0:
+        raise ValueError(f"step_size * leak must be 1 at most, got {most:g}: a sample would take more than the weight")
+    return controller
 
 
-class OptimalLeakyFxLMS(CoreController):
-    r"""Leaky FxLMS with the leak for a rated power, computed online.
+@controller_maker
+def optimal_leaky_fx_lms(
+    n_taps: int,
+    secondary: Secondary,
+    *,
+    step_size: float,
+    rated_power: PerLoudspeaker | None = None,
+    constraint: Constraints = None,
+    fs: float | None = None,
+    amplifier: Amplifiers = None,
+    n_references: int = 1,
+    limiter: Limiters = None,
+) -> CoreController:
+    r"""Return leaky FxLMS with the leak for a rated power, computed online.
 
     .. math:: \gamma(n) = E[x^2] \max\{\sqrt{G_s \delta_d^2 / \rho_o} - G_s,\ 0\}
 
     The formula is that of `leak_factor`, and the powers are estimated as in KF-OPC. With several loudspeakers, each has
-    its own gamma, from the sums stated in `MOVFxLMS`.
+    its own gamma, from the sums stated in `mov_fx_lms`.
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, n_references
-        As for `FxLMS`.
+    n_taps, secondary, step_size, n_references
+        As for `fx_lms`.
     rated_power : float or array_like, shape (J,), optional
         Rated output power rho_o, or that of each loudspeaker.
     constraint : OutputPowerConstraint or sequence of J of them, optional
         Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
+    fs : float, optional
+        Sample rate in Hz of the power estimates; a system, a recording or a plant as `secondary` brings it.
     amplifier : callable or sequence of J of them, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
-        As for `FxLMS`.
+        As for `fx_lms`.
+
+    Returns
+    -------
+    CoreController
+        A controller named optimal leaky FxLMS.
 
     Raises
     ------
@@ -157,35 +174,21 @@ class OptimalLeakyFxLMS(CoreController):
 
     Examples
     --------
-    >>> from kfopc_filterpy import OptimalLeakyFxLMS
-    >>> OptimalLeakyFxLMS(4, secondary_path=[1.0], step_size=0.1, rated_power=0.5).rated_power
+    >>> from kfopc_filterpy import optimal_leaky_fx_lms
+    >>> optimal_leaky_fx_lms(4, [1.0], step_size=0.1, rated_power=0.5, fs=16000).rated_power
     0.5
     """
-
-    name = "optimal leaky FxLMS"
-    algorithm = "optimal_leaky"
-    needs_rated_power = True
-    step_size = setting("Step size mu.")
-
-    def __init__(
-        self,
-        n_taps: int,
-        secondary_path: PathModels,
-        *,
-        step_size: float,
-        rated_power: PerLoudspeaker | None = None,
-        constraint: Constraints = None,
-        amplifier: Amplifiers = None,
-        n_references: int = 1,
-        limiter: Limiters = None,
-    ) -> None:
-        super().__init__(
-            n_taps,
-            secondary_path,
-            settings={"step_size": step_size},
-            n_references=n_references,
-            amplifier=amplifier,
-            rated_power=rated_power,
-            constraint=constraint,
-            limiter=limiter,
-        )
+    require_rated_power(rated_power, constraint)
+    return CoreController(
+        "optimal leaky FxLMS",
+        "optimal_leaky",
+        n_taps,
+        secondary,
+        settings={"step_size": step_size},
+        n_references=n_references,
+        amplifier=amplifier,
+        rated_power=rated_power,
+        constraint=constraint,
+        fs=fs,
+        limiter=limiter,
+    )

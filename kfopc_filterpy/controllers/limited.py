@@ -41,7 +41,7 @@ class LimitedController(WrappedController):
     ...         return 10.0 * reference
     ...     def update(self, error):
     ...         pass
-    >>> controller = LimitedController(Loud(), OutputLimiter(rated_power=1.0, amplitude_limit=2.0))
+    >>> controller = LimitedController(Loud(), OutputLimiter(rated_power=1.0, fs=16000, amplitude_limit=2.0))
     >>> controller.control_signal(1.0)
     2.0
     """

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from .._types import NumberOrArray, PathModels, PerLoudspeaker
+from .._types import PerLoudspeaker, Secondary
 from .._validate import as_choice, as_nonnegative, as_positive
 from ..power.amplifiers import Amplifiers
 from ..power.constraint import Constraints
 from ..power.limiter import Limiters
-from .core_controller import CoreController, setting
+from .core_controller import CoreController
+from .making import controller_maker, require_rated_power
 
 
 def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_path_gain: float) -> float:
@@ -57,8 +58,22 @@ def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_pa
     return max(math.sqrt(gain) * math.sqrt(power / rated_power) - gain, 0.0)
 
 
-class MOVFxLMS(CoreController):
-    r"""Minimum-output-variance FxLMS: FxLMS with a penalty that keeps the control power within the rated power.
+@controller_maker
+def mov_fx_lms(
+    n_taps: int,
+    secondary: Secondary,
+    *,
+    step_size: float,
+    rated_power: PerLoudspeaker | None = None,
+    constraint: Constraints = None,
+    fs: float | None = None,
+    amplifier: Amplifiers = None,
+    penalty_factor: PerLoudspeaker | None = None,
+    modified: bool = False,
+    n_references: int = 1,
+    limiter: Limiters = None,
+) -> CoreController:
+    r"""Return MOV-FxLMS, minimum-output-variance FxLMS: a penalty keeps the control power within the rated power.
 
     .. math::
 
@@ -77,22 +92,29 @@ class MOVFxLMS(CoreController):
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, n_references
-        As for `FxLMS`.
+    n_taps, secondary, step_size, n_references
+        As for `fx_lms`.
     rated_power : float or array_like, shape (J,), optional
         Rated output power rho_o, or that of each loudspeaker.
     constraint : OutputPowerConstraint or sequence of J of them, optional
         Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
+    fs : float, optional
+        Sample rate in Hz of the power estimates; a system, a recording or a plant as `secondary` brings it.
     amplifier : callable or sequence of J of them, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
-        As for `FxLMS`.
+        As for `fx_lms`.
     penalty_factor : float or array_like, shape (J,), optional
         Fixed penalty factor gamma, or that of each loudspeaker, zero or above; the function `penalty_factor` computes it for a rated power. By
         default gamma follows the running powers.
     modified : bool, default False
         Adapt to ``d^ - w' x'`` instead of the error, in the modified structure of Lai et al. The delay of the secondary
         path then does not limit the step size. The controller is named MOV-MFxLMS.
+
+    Returns
+    -------
+    CoreController
+        A controller named MOV-FxLMS, or MOV-MFxLMS if it is modified.
 
     Raises
     ------
@@ -111,56 +133,27 @@ class MOVFxLMS(CoreController):
 
     Examples
     --------
-    >>> from kfopc_filterpy import MOVFxLMS
-    >>> controller = MOVFxLMS(4, secondary_path=[1.0], step_size=0.1, rated_power=0.5)
+    >>> from kfopc_filterpy import mov_fx_lms
+    >>> controller = mov_fx_lms(4, [1.0], step_size=0.1, rated_power=0.5, fs=16000)
     >>> controller.rated_power
     0.5
     """
-
-    name = "MOV-FxLMS"
-    algorithm = "mov"
-    needs_rated_power = True
-    step_size = setting("Step size mu.")
-    checks = dict.fromkeys(("penalty_factor", "modified"), as_nonnegative)
-
-    def __init__(
-        self,
-        n_taps: int,
-        secondary_path: PathModels,
-        *,
-        step_size: float,
-        rated_power: PerLoudspeaker | None = None,
-        constraint: Constraints = None,
-        amplifier: Amplifiers = None,
-        n_references: int = 1,
-        limiter: Limiters = None,
-        penalty_factor: PerLoudspeaker | None = None,
-        modified: bool = False,
-    ) -> None:
-        modified = as_choice(modified, "modified", (True, False))
-        settings: dict[str, Any] = {"step_size": step_size, "modified": float(modified)}
-        if penalty_factor is not None:
-            self.algorithm = "mov_fixed"
-            settings["penalty_factor"] = penalty_factor
-        super().__init__(
-            n_taps,
-            secondary_path,
-            settings=settings,
-            n_references=n_references,
-            amplifier=amplifier,
-            rated_power=rated_power,
-            constraint=constraint,
-            limiter=limiter,
-        )
-        if modified:
-            self.name = "MOV-MFxLMS"
-
-    @property
-    def modified(self) -> bool:
-        """True if the controller adapts to ``d^ - w' x'`` instead of the error."""
-        return bool(self._of_setting("modified"))
-
-    @property
-    def penalty_factor(self) -> NumberOrArray:
-        """Fixed penalty factor gamma, with several channels (J,); None if it follows the running powers."""
-        return self._of_setting("penalty_factor") if self.algorithm == "mov_fixed" else None
+    changed = as_choice(modified, "modified", (True, False))
+    settings: dict[str, Any] = {"step_size": step_size, "modified": float(changed)}
+    if penalty_factor is None:
+        require_rated_power(rated_power, constraint)
+    else:
+        settings["penalty_factor"] = penalty_factor
+    return CoreController(
+        "MOV-MFxLMS" if changed else "MOV-FxLMS",
+        "mov" if penalty_factor is None else "mov_fixed",
+        n_taps,
+        secondary,
+        settings=settings,
+        n_references=n_references,
+        amplifier=amplifier,
+        rated_power=rated_power,
+        constraint=constraint,
+        fs=fs,
+        limiter=limiter,
+    )

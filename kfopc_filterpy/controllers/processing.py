@@ -81,10 +81,10 @@ class BlockProcessing:
         Examples
         --------
         >>> import numpy as np
-        >>> from kfopc_filterpy import FxLMS
+        >>> from kfopc_filterpy import fx_lms
         >>> path = np.zeros(65)
         >>> path[64] = 1.0  # blocks of 64 samples: a sample is heard 64 samples later
-        >>> controller = FxLMS(16, path, step_size=1e-3)
+        >>> controller = fx_lms(16, path, step_size=1e-3)
         >>> block = np.ones(64)
         >>> controller.process(block, 0.5 * block).shape
         (64,)
@@ -137,6 +137,8 @@ def block_signals(controller: Any, references: Any, errors: Any) -> tuple[np.nda
     if states_channels(controller):
         if controller.multichannel:
             x, e = np.atleast_2d(x), np.atleast_2d(e)
+        else:
+            x, e = (signal[0] if signal.ndim == 2 and len(signal) == 1 else signal for signal in (x, e))
         if not none:
             require_channels(x, "references", controller.multichannel, controller.n_references)
         require_channels(e, "errors", controller.multichannel, controller.n_microphones)

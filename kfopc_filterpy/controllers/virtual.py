@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PathModels, PerMicrophone
+from .._types import NumberOrArray, PerMicrophone, Secondary
 from .._validate import as_channels, as_count, as_real_array, per_channel, require_finite
 from ..core.block import LOUDEST
 from ..paths.observation import ObservationFilters
-from ..paths.path_matrix import secondary_paths
+from ..plant import estimated_secondary
 from ..power.amplifiers import Amplifiers
 from .base import Controller, WrappedController, differing_counts, listening
 from .channel_samples import ChannelFilters, PlayedSound, require_moderate
@@ -216,7 +216,7 @@ class VirtualMicrophones(WrappedController):
         Controller for the virtual microphones: it takes errors (K_v,), and its secondary paths are those to the virtual
         microphones. With an internal model, its reference is :math:`\hat d_v(n - 1)`, for a headrest without
         a reference microphone. A controller of your own works too.
-    secondary_path : array_like, shape (K, J, taps), or nested sequence of control systems
+    secondary : array_like, shape (K, J, taps), nested sequence of control systems, or Plant
         Estimated secondary paths to all microphones of the plant, physical and virtual.
     observer : ObservationFilters, array_like of shape (K_v, K_p, n_taps), KalmanObserver, or an object like it
         Estimator of the disturbance at the virtual microphones. An object of your own needs two methods:
@@ -256,16 +256,16 @@ class VirtualMicrophones(WrappedController):
     With one loudspeaker, the noise passes the physical microphone and reaches the virtual one a sample later:
 
     >>> import numpy as np
-    >>> from kfopc_filterpy import FxLMS, noise_reduction_db, simulate
+    >>> from kfopc_filterpy import Plant, fx_lms, noise_reduction_db, simulate
     >>> from kfopc_filterpy.controllers import VirtualMicrophones
     >>> secondary = np.zeros((2, 1, 4))
     >>> secondary[:, 0, 1] = [0.5, 1.0]  # physical, virtual
     >>> primary = np.zeros((2, 1, 8))
     >>> primary[[0, 1], 0, [4, 5]] = 1.0
-    >>> ears = FxLMS(8, secondary[1:], step_size=0.01)
-    >>> controller = VirtualMicrophones(ears, secondary, [[[0.0, 1.0]]], physical=[0])
-    >>> x = np.random.default_rng(0).standard_normal((1, 4000))
-    >>> result = simulate(controller, x, primary_path=primary, secondary_path=secondary)
+    >>> plant = Plant(secondary, primary, fs=16000)
+    >>> ears = fx_lms(8, secondary[1:], step_size=0.01)
+    >>> controller = VirtualMicrophones(ears, plant, [[[0.0, 1.0]]], physical=[0])
+    >>> result = simulate(controller, np.random.default_rng(0).standard_normal(4000), plant)
     >>> result.error.shape, bool(noise_reduction_db(result.error[1], result.disturbance[1]) > 60)
     ((2, 4000), True)
     """
@@ -273,7 +273,7 @@ class VirtualMicrophones(WrappedController):
     def __init__(
         self,
         controller: Controller,
-        secondary_path: PathModels,
+        secondary: Secondary,
         observer: KalmanObserver | ArrayLike,
         *,
         physical: Sequence[int],
@@ -281,23 +281,28 @@ class VirtualMicrophones(WrappedController):
         amplifier: Amplifiers = None,
     ) -> None:
         super().__init__(controller, "with virtual microphones")
-        secondary, self._path_fs = secondary_paths(secondary_path)
-        self.n_microphones, self.n_loudspeakers, _ = secondary.shape
+        paths, self._path_fs = estimated_secondary(secondary)
+        self.n_microphones, self.n_loudspeakers, _ = paths.shape
         self.physical = self._indices(physical, "physical")
         others = np.setdiff1d(np.arange(self.n_microphones), self.physical)
         self.virtual = others if virtual is None else self._indices(virtual, "virtual")
         if not self.virtual.size:
-            raise ValueError(f"virtual must name a microphone: all {self.n_microphones} of secondary_path are physical")
+            raise ValueError(f"virtual must name a microphone: all {self.n_microphones} of secondary are physical")
         self.observer = self._checked_observer(observer)
         self._require_fitting_controller()
-        self._sound = PlayedSound(secondary, amplifier)
+        self._sound = PlayedSound(paths, amplifier)
         self._virtual_error, self._awaits_error = np.zeros(self.virtual.size), False
+
+    @property
+    def multichannel(self) -> bool:
+        """Whether signals have a channel axis: always, since the plant has a physical and a virtual microphone at least."""
+        return True
 
     def _indices(self, value: Any, name: str) -> np.ndarray:
         indices = np.array([as_count(index, name, minimum=0) for index in value])
         if not indices.size or indices.max() >= self.n_microphones or np.unique(indices).size < indices.size:
             raise ValueError(
-                f"{name} must be different indices of the {self.n_microphones} microphones of secondary_path, "
+                f"{name} must be different indices of the {self.n_microphones} microphones of secondary, "
                 f"got {indices.tolist()}"
             )
         return indices
@@ -337,7 +342,7 @@ class VirtualMicrophones(WrappedController):
         return self._virtual_error.copy()
 
     def _pass_on(self, name: str, value: Any) -> None:
-        if name == "secondary_path":
+        if name == "secondary":
             raise AttributeError(
                 "VirtualMicrophones takes no new secondary path: its observer belongs to the paths that it was made "
                 "with; make it again with the new ones"

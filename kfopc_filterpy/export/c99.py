@@ -50,13 +50,13 @@ class CExport:
     --------
     >>> import tempfile
     >>> from pathlib import Path
-    >>> from kfopc_filterpy import FxLMS
+    >>> from kfopc_filterpy import fx_lms
     >>> from kfopc_filterpy.export import export_c
-    >>> controller = FxLMS(16, [0.0, 1.0], step_size=0.01)
+    >>> controller = fx_lms(16, [0.0, 1.0], step_size=0.01)
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     exported = export_c(controller, Path(folder) / "anc.c", dtype="float32")
     >>> exported
-    <CExport anc.c: FxLMS, 16 taps, float32, state of 4,176 bytes>
+    <CExport anc.c: FxLMS, 16 taps, float32, state of 4,112 bytes>
     """
 
     path: Path
@@ -101,7 +101,7 @@ def export_c(
     Parameters
     ----------
     controller : CoreController
-        One whose algorithm is in the core, such as the FxLMS family, `DiagonalKalman`, or what
+        One whose algorithm is in the core, such as the FxLMS family, `diagonal_kf`, or what
         `kf_anc`, `kf_opc`, `kf_pb` and `fx_rls` return, with whatever it has: several channels,
         limiters, amplifier models, an uncertain secondary path, sliding windows. It is not changed.
     path : str or pathlib.Path
@@ -132,7 +132,7 @@ def export_c(
     >>> from pathlib import Path
     >>> from kfopc_filterpy import kf_opc
     >>> from kfopc_filterpy.export import export_c
-    >>> controller = kf_opc(8, [0.0, 1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1)
+    >>> controller = kf_opc(8, [0.0, 1.0], rated_power=0.5, fs=16000, state_noise=1e-6, measurement_noise=0.1)
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     exported = export_c(controller, Path(folder) / "left.c")
     ...     header = exported.header_path.read_text(encoding="utf-8")

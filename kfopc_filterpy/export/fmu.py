@@ -73,9 +73,9 @@ def export_fmu(
 
     Examples
     --------
-    >>> from kfopc_filterpy import FxLMS
+    >>> from kfopc_filterpy import fx_lms
     >>> from kfopc_filterpy.export import export_fmu
-    >>> controller = FxLMS(16, [0.0, 1.0], step_size=0.01)
+    >>> controller = fx_lms(16, [0.0, 1.0], step_size=0.01)
     >>> export_fmu(controller, "anc.zip", fs=16000)
     Traceback (most recent call last):
         ...

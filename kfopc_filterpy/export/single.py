@@ -43,13 +43,13 @@ class Float32Controller:
     Examples
     --------
     >>> import numpy as np
-    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy import Plant, fx_lms, simulate
     >>> from kfopc_filterpy.export import Float32Controller
-    >>> controller = FxLMS(8, [0.0, 1.0], step_size=0.01)
+    >>> plant = Plant([0.0, 1.0], [0.0, 0.0, 0.5], fs=16000)
+    >>> controller = fx_lms(8, plant, step_size=0.01)
     >>> x = np.random.default_rng(0).standard_normal(1000)
-    >>> plant = {"primary_path": [0.0, 0.0, 0.5], "secondary_path": [0.0, 1.0]}
-    >>> single = simulate(Float32Controller(controller), x, **plant).error
-    >>> difference = single - simulate(controller, x, **plant).error
+    >>> single = simulate(Float32Controller(controller), x, plant).error
+    >>> difference = single - simulate(controller, x, plant).error
     >>> bool(1e-9 < np.abs(difference).max() < 1e-6)
     True
     """

@@ -119,7 +119,7 @@ class KFOPC(KalmanFilter, Checkpointed):
     --------
     >>> import numpy as np
     >>> from kfopc_filterpy import KFOPC, OutputPowerConstraint
-    >>> kf = KFOPC(dim_x=2, constraint=OutputPowerConstraint(rated_power=1.0, secondary_path_gain=1.0))
+    >>> kf = KFOPC(dim_x=2, constraint=OutputPowerConstraint(rated_power=1.0, fs=16000, secondary_path_gain=1.0))
     >>> kf.predict()
     >>> kf.update(4.0, H=np.array([1.0, 0.5]))
     >>> kf.constraint_factor  # sqrt(1 * 1 / 4**2)
@@ -413,9 +413,9 @@ class KFOPC(KalmanFilter, Checkpointed):
         elif self._constraint is not None and (one or isinstance(self._constraint, tuple)):
             self._constraint.rated_power = value
         else:
-            from ..power.constraint import OutputPowerConstraint
+            from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
 
-            settings = self._constraint or self._lifted or OutputPowerConstraint(1.0)
+            settings = self._constraint or self._lifted or OutputPowerConstraint(1.0, fs=DEFAULT_FS)
             together = one or isinstance(settings, tuple)
             self.constraint = settings.fresh(powers) if together else [settings.fresh(power) for power in powers]
 

@@ -6,8 +6,7 @@ from .analysis import group_delay as group_delay
 from .analysis import phase_error as phase_error
 from .analysis import secondary_path_gain as secondary_path_gain
 from .duct import Duct as Duct
-from .duct import DuctPaths as DuctPaths
-from .duct import duct_paths as duct_paths
+from .duct import duct_plant as duct_plant
 from .feedback_stability import FeedbackMargin as FeedbackMargin
 from .feedback_stability import feedback_margin as feedback_margin
 from .feedback_stability import internal_model_margin as internal_model_margin

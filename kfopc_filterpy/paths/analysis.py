@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from .._types import PathModel
 from .._validate import as_band, as_number, as_positive, as_signal
+from ..plant import Plant, as_plant
 from .file_checks import require_sound
 from .models import finite_taps, path_taps, sampling_rate
-from .path_matrix import PRIMARY_AXES, SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 
 STABILITY_BOUND_DEG = 90.0
 """Phase error of the estimate beyond which filtered-reference adaptation diverges, in degrees."""
@@ -298,7 +298,7 @@ def achieved_band(path: PathModel, level_db: float = -3.0, *, fs: float | None =
     Examples
     --------
     >>> from kfopc_filterpy import bandpass_path
-    >>> band = achieved_band(bandpass_path(32), level_db=-6.0)  # designed for 20 to 5000 Hz
+    >>> band = achieved_band(bandpass_path(32, fs=16000), level_db=-6.0)  # designed for 20 to 5000 Hz
     >>> band.low_hz, round(band.high_hz)
     (0.0, 4997)
     """
@@ -411,10 +411,8 @@ def energy_onset(taps: np.ndarray, share: float = 0.01) -> int:
 
 
 def causality_margin(
-    primary: PathModel,
-    secondary: PathModel,
+    plant: Plant,
     *,
-    fs: float | None = None,
     band: tuple[float, float] | None = None,
     onset_share: float = 0.01,
 ) -> CausalityMargin:
@@ -424,12 +422,8 @@ def causality_margin(
 
     Parameters
     ----------
-    primary : control.TransferFunction or array_like, shape (n_taps,) or (K, I, n_taps)
-        Primary path with a finite impulse response, or that from each of I references to each of K microphones.
-    secondary : control.TransferFunction or array_like, shape (n_taps,) or (K, J, n_taps)
-        Secondary path, or that from each of J loudspeakers to each microphone.
-    fs : float, optional
-        Sampling rate in Hz, needed for tap arrays.
+    plant : Plant
+        Plant with a primary path.
     band : (float, float), optional
         Band in Hz over which the group delay is averaged, by default all frequencies.
     onset_share : float, default 0.01
@@ -445,20 +439,19 @@ def causality_margin(
     Raises
     ------
     TypeError, ValueError
-        If the paths differ in sampling rate or in the number of microphones, no sound reaches a microphone, or an
-        argument is out of range.
+        If the plant has no primary path or changes, no sound reaches a microphone, or an argument is out of range.
 
     Examples
     --------
-    >>> from kfopc_filterpy import bandpass_path
-    >>> margin = causality_margin(bandpass_path(128), bandpass_path(32))
+    >>> from kfopc_filterpy import Plant, bandpass_path
+    >>> margin = causality_margin(Plant(bandpass_path(32, fs=16000), bandpass_path(128, fs=16000)))
     >>> round(margin.margin_samples), round(margin.group_delay_margin_samples)
     (45, 48)
 
     Two loudspeakers and two microphones, in which sounds arrive after whole samples:
 
     >>> arriving = lambda samples: np.eye(16)[np.array(samples)]
-    >>> margin = causality_margin(arriving([[9], [10]]), arriving([[2, 7], [6, 5]]), fs=8000.0)
+    >>> margin = causality_margin(Plant(arriving([[2, 7], [6, 5]]), arriving([[9], [10]]), fs=8000))
     >>> margin.margins_s * margin.fs
     array([[7., 2.],
            [4., 5.]])
@@ -468,12 +461,11 @@ def causality_margin(
     share = as_positive(onset_share, "onset_share")
     if share >= 1:
         raise ValueError(f"onset_share must be below 1, got {share:g}")
-    several = is_path_matrix(primary) or is_path_matrix(secondary)
-    p, fs = sampled_path_matrix(primary, fs, "primary", PRIMARY_AXES)
-    s, fs = sampled_path_matrix(secondary, fs, "secondary", SECONDARY_AXES)
+    as_plant(plant).require_constant("causality_margin")
+    if plant.primary is None:
+        raise ValueError("plant must have a primary path: make it with Plant(secondary, primary)")
+    p, s, fs = plant.primary, plant.secondary, plant.fs
     low, high = (0.0, fs / 2) if band is None else as_band(band, fs)
-    if len(p) != len(s):
-        raise ValueError(f"primary and secondary must have the same K microphones first, got {len(p)} and {len(s)}")
     require_sound("primary", p)
     require_sound("secondary", s)
 
@@ -483,7 +475,7 @@ def causality_margin(
     onsets = [of_each(paths, lambda h: energy_onset(h, share) / fs) for paths in (p, s)]
     delays = [of_each(paths, lambda h: _mean_group_delay(h, low, high, fs)) for paths in (p, s)]
     found: list[Any] = [onsets[0].min(axis=1), onsets[1], delays[0].min(axis=1), delays[1]]
-    onset_p, onset_s, delay_p, delay_s = found if several else (one.item() for one in found)
+    onset_p, onset_s, delay_p, delay_s = (one.item() for one in found) if plant.has_one_channel(p[0]) else found
     return CausalityMargin(onset_p, onset_s, delay_p, delay_s, fs)
 
 

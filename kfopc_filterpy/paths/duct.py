@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .._validate import as_count, as_nonnegative, as_number, as_positive
-from .models import fir_path
-
-if TYPE_CHECKING:
-    import control
+from ..plant import Plant
 
 # Share of a response's energy that may be cut off: -50 dB if the number of taps is chosen here, -40 dB if it is given.
 _CHOSEN_CUT, _ALLOWED_CUT = 1e-5, 1e-4
@@ -22,7 +18,7 @@ _N_FFT = 2**16
 
 @dataclass(frozen=True)
 class Duct:
-    """Geometry and acoustics of a duct with its loudspeaker, from which `duct_paths` computes the paths.
+    """Geometry and acoustics of a duct with its loudspeaker, from which `duct_plant` computes the paths.
 
     Positions count from the end near the noise source, in the order source, reference microphone, loudspeaker, error
     microphone.
@@ -133,32 +129,10 @@ class Duct:
             )
 
 
-@dataclass(frozen=True)
-class DuctPaths:
-    """Primary and secondary path of a duct; made by `duct_paths`.
-
-    Attributes
-    ----------
-    primary : control.TransferFunction
-        From the reference signal to the error microphone.
-    secondary : control.TransferFunction
-        From the control signal, through the loudspeaker, to the error microphone.
-    fs : float
-        Sampling rate in Hz.
-    model : Duct
-        The duct that they were computed from.
-    """
-
-    primary: control.TransferFunction
-    secondary: control.TransferFunction
-    fs: float
-    model: Duct
-
-
-def duct_paths(
-    duct: Duct | None = None, *, fs: float = 16000.0, primary_taps: int | None = None, secondary_taps: int | None = None
-) -> DuctPaths:
-    r"""Compute the two paths of a duct with reflecting ends, in which plane waves travel.
+def duct_plant(
+    duct: Duct | None = None, *, fs: float, primary_taps: int | None = None, secondary_taps: int | None = None
+) -> Plant:
+    r"""Return the two paths of a duct with reflecting ends, in which plane waves travel.
 
     All images of a source at :math:`x_s` sum up, at a microphone at :math:`x > x_s`, to
 
@@ -183,16 +157,16 @@ def duct_paths(
     ----------
     duct : Duct, optional
         The duct, by default ``Duct()``.
-    fs : float, default 16000
-        Sampling rate in Hz.
+    fs : float
+        Sample rate in Hz.
     primary_taps, secondary_taps : int, optional
         Lengths of the impulse responses; by default the smallest multiples of 64 that leave out no more than -50 dB of
         their energy: 832 and 640 for the default duct. Given lengths may leave out -40 dB.
 
     Returns
     -------
-    DuctPaths
-        Both paths as python-control systems.
+    Plant
+        Primary and secondary path, with linear amplifiers.
 
     Raises
     ------
@@ -206,10 +180,8 @@ def duct_paths(
 
     Examples
     --------
-    >>> from kfopc_filterpy.paths import path_taps
-    >>> paths = duct_paths()
-    >>> path_taps(paths.primary).size, path_taps(paths.secondary).size
-    (832, 640)
+    >>> duct_plant(fs=16000)
+    <Plant at 16000 Hz: secondary path of 640 taps, primary path of 832 taps>
     """
     fs = as_positive(fs, "fs", unit="Hz")
     duct = Duct() if duct is None else duct
@@ -233,11 +205,8 @@ def duct_paths(
     if duct.loudspeaker_resonance_hz is not None:
         relative = f / duct.loudspeaker_resonance_hz
         secondary *= -(relative**2) / (1 - relative**2 + 1j * relative / duct.loudspeaker_q)
-    return DuctPaths(
-        primary=fir_path(_sampled(primary, primary_taps, "primary_taps"), fs, "primary"),
-        secondary=fir_path(_sampled(secondary, secondary_taps, "secondary_taps"), fs, "secondary"),
-        fs=fs,
-        model=duct,
+    return Plant(
+        _sampled(secondary, secondary_taps, "secondary_taps"), _sampled(primary, primary_taps, "primary_taps"), fs=fs
     )
 
 

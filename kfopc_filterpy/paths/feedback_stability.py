@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from .._types import PathModels
 from .._validate import as_real_array
-from .path_matrix import SECONDARY_AXES, path_matrix, sampled_path_matrix
+from ..plant import Plant, as_plant
+from .path_matrix import path_matrix
 
 if TYPE_CHECKING:
     import control
@@ -107,13 +108,7 @@ class FeedbackMargin:
             return 1.0 / _largest(0.0, *responses)
 
 
-def feedback_margin(
-    control_filter: PathModels,
-    feedback_path: PathModels,
-    feedback_estimate: PathModels | None = None,
-    *,
-    fs: float | None = None,
-) -> FeedbackMargin:
+def feedback_margin(control_filter: PathModels, plant: Plant, estimate: PathModels | None = None) -> FeedbackMargin:
     r"""Return whether acoustic feedback through a control filter is stable, and with what margin.
 
     The control signal reaches the reference microphone through the feedback path, and a `FeedbackNeutralizer` subtracts
@@ -128,12 +123,10 @@ def feedback_margin(
     ----------
     control_filter : array_like, shape (n_taps,) or (J, I, n_taps)
         Control filter w, for example `control_filter` of a controller.
-    feedback_path : array_like, shape (n_path,) or (I, J, n_path), or control.TransferFunction
-        Path f from the loudspeaker to the reference microphone; its first tap must be 0.
-    feedback_estimate : array_like or control.TransferFunction, optional
+    plant : Plant
+        Plant with the feedback path f from the loudspeaker to the reference microphone.
+    estimate : array_like, shape (n_taps,) or (I, J, n_taps), or control system, optional
         Estimate of this path, which is subtracted; by default none.
-    fs : float, optional
-        Sampling rate in Hz, needed for tap arrays.
 
     Returns
     -------
@@ -162,33 +155,33 @@ def feedback_margin(
     A gain of 0.5 once around the loop, then the same with an estimate of the path that is 10 % too small, then a gain
     of 2 without an estimate:
 
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.paths import feedback_margin
-    >>> feedback_margin([0.5], [0.0, 1.0], fs=8000.0)
+    >>> plant = Plant([1.0], feedback=[0.0, 1.0], fs=8000)
+    >>> feedback_margin([0.5], plant)
     <FeedbackMargin: stable, disk margin 0.667, gain 6.02 dB, phase 36.9 degrees, least at 0 Hz; path error 100 % at 0 Hz>
-    >>> feedback_margin([0.5], [0.0, 1.0], [0.0, 0.9], fs=8000.0).gain_margin_db.__round__(1)
+    >>> feedback_margin([0.5], plant, [0.0, 0.9]).gain_margin_db.__round__(1)
     26.0
-    >>> feedback_margin([2.0], [0.0, 1.0], fs=8000.0)
+    >>> feedback_margin([2.0], plant)
     <FeedbackMargin: unstable>
     """
-    f, fs = sampled_path_matrix(feedback_path, fs, "feedback_path", "(I references, J loudspeakers, taps)")
-    estimate = _estimate(feedback_estimate, np.zeros_like(f), fs, "feedback_estimate")
+    as_plant(plant).require_constant("feedback_margin")
+    if plant.feedback is None:
+        raise ValueError("plant must have a feedback path: make it with Plant(..., feedback=...)")
+    f, fs = plant.feedback, plant.fs
+    estimated = _estimate(estimate, np.zeros_like(f), fs)
     w, _ = path_matrix(control_filter, fs=fs, name="control_filter")
     _require_fit(w, f, w.shape[1])
-    left = np.zeros((*f.shape[:2], max(f.shape[2], estimate.shape[2])))
+    left = np.zeros((*f.shape[:2], max(f.shape[2], estimated.shape[2])))
     left[..., : f.shape[2]] += f
-    left[..., : estimate.shape[2]] -= estimate
-    for first in left[..., 0].flat:
-        if first != 0.0:
-            raise ValueError(f"feedback_path must have a delay of at least one sample: a first tap is {first:g}, not 0")
+    left[..., : estimated.shape[2]] -= estimated
+    if np.any(left[..., 0]):
+        raise ValueError("estimate must have a delay of at least one sample: a first tap is not 0")
     return _margin(w, -left, np.zeros_like(left[..., :1]), fs)
 
 
 def internal_model_margin(
-    control_filter: PathModels,
-    secondary_path: PathModels,
-    secondary_estimate: PathModels | None = None,
-    *,
-    fs: float | None = None,
+    control_filter: PathModels, plant: Plant, estimate: PathModels | None = None
 ) -> FeedbackMargin:
     r"""Return whether a feedback controller's loop is stable, and which error of its secondary path it tolerates.
 
@@ -207,12 +200,10 @@ def internal_model_margin(
     control_filter : array_like, shape (n_taps,) or (J, K, n_taps)
         Settled control filter w: `control_filter` of a feedback controller. That of a hybrid controller has the shape
         (J, I + K, n_taps); its last K inputs, the disturbances, are used.
-    secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control.TransferFunction
-        True path s from the loudspeaker to the error microphone.
-    secondary_estimate : array_like or control.TransferFunction, optional
+    plant : Plant
+        Plant with the true secondary path s from the loudspeaker to the error microphone.
+    estimate : array_like, shape (n_taps,) or (K, J, n_taps), or control system, optional
         The controller's estimate of this path; by default the path itself.
-    fs : float, optional
-        Sampling rate in Hz, needed for tap arrays.
 
     Returns
     -------
@@ -233,34 +224,33 @@ def internal_model_margin(
     A path that delays by one sample and a filter that predicts half of the disturbance, then the same with a path 2.9 and 3.1
     times as large as its estimate:
 
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.paths import internal_model_margin
-    >>> internal_model_margin([0.5], [0.0, 1.0], fs=8000.0).path_error.__round__(9)
+    >>> internal_model_margin([0.5], Plant([0.0, 1.0], fs=8000)).path_error.__round__(9)
     2.0
-    >>> internal_model_margin([0.5], [0.0, 2.9], [0.0, 1.0], fs=8000.0).stable
-    True
-    >>> internal_model_margin([0.5], [0.0, 3.1], [0.0, 1.0], fs=8000.0).stable
-    False
+    >>> [internal_model_margin([0.5], Plant([0.0, gain], fs=8000), [0.0, 1.0]).stable for gain in (2.9, 3.1)]
+    [True, False]
 
     Two such loops, with both loudspeakers heard at both microphones: the gain doubles if the disturbances are equal.
 
     >>> import numpy as np
     >>> filters, path = np.zeros((2, 2, 2, 2))
     >>> filters[..., 0], path[..., 1] = 0.5 * np.eye(2), 1.0
-    >>> internal_model_margin(filters, path, fs=8000.0).path_error.__round__(9)
+    >>> internal_model_margin(filters, Plant(path, fs=8000)).path_error.__round__(9)
     1.0
     """
-    s, fs = sampled_path_matrix(secondary_path, fs, "secondary_path", SECONDARY_AXES)
-    estimate = _estimate(secondary_estimate, s, fs, "secondary_estimate")
+    as_plant(plant).require_constant("internal_model_margin")
+    s, fs = plant.secondary, plant.fs
     w, _ = path_matrix(control_filter, fs=fs, name="control_filter")
     _require_fit(w, s, min(w.shape[1], len(s)))
-    return _margin(np.pad(w[:, -len(s) :], ((0, 0), (0, 0), (1, 0))), s, estimate, fs)
+    return _margin(np.pad(w[:, -len(s) :], ((0, 0), (0, 0), (1, 0))), s, _estimate(estimate, s, fs), fs)
 
 
-def _estimate(paths: PathModels | None, default: np.ndarray, fs: float, name: str) -> np.ndarray:
+def _estimate(paths: PathModels | None, default: np.ndarray, fs: float) -> np.ndarray:
     """Return the estimate of a path as taps, with the channels of the `default`."""
-    estimate = default if paths is None else path_matrix(paths, fs=fs, name=name)[0]
+    estimate = default if paths is None else path_matrix(paths, fs=fs, name="estimate")[0]
     if estimate.shape[:2] != default.shape[:2]:
-        raise ValueError(f"{name} must have the channels of the path, {default.shape[:2]}, got {estimate.shape[:2]}")
+        raise ValueError(f"estimate must have the channels of the path, {default.shape[:2]}, got {estimate.shape[:2]}")
     return estimate
 
 

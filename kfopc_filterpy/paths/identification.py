@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polysub
 from numpy.typing import ArrayLike
 
-from .._types import PathModel, PathModels, Seed
+from .._types import PathModel, Seed
 from .._validate import (
     as_channels,
     as_choice,
@@ -23,11 +23,11 @@ from .._validate import (
     require_channels_lead,
     require_finite,
 )
-from ..power.amplifiers import amplifier_of_each
+from ..plant import Plant, as_plant
+from ..power.amplifiers import amplified_signal
 from .analysis import responses_of_both
 from .least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve, ridge_solve
 from .models import fir_path, path_taps
-from .path_matrix import SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 from .uncertainty import relative_to
 
 if TYPE_CHECKING:
@@ -319,16 +319,13 @@ def _system(taps: np.ndarray, fs: float) -> control.TransferFunction:
 
 
 def identify_secondary_path(
-    secondary_path: PathModels,
+    plant: Plant,
     *,
     n_taps: int,
     duration_s: float,
     rng: Seed,
-    fs: float | None = None,
     excitation: str = "white",
     level: float = 1.0,
-    amplifier: Callable[[np.ndarray], np.ndarray] | Sequence[Callable[[np.ndarray], np.ndarray] | None] | None = None,
-    sensor_noise_std: float = 0.0,
     regularization: float = 1e-5,
     frequencies_hz: ArrayLike | None = None,
     loudspeakers: str = "in turn",
@@ -340,25 +337,18 @@ def identify_secondary_path(
 
     Parameters
     ----------
-    secondary_path : control.TransferFunction or array_like, shape (n_path,) or (K, J, n_path)
-        True path s with a finite impulse response, or that from each of J loudspeakers to each of K microphones.
+    plant : Plant
+        Plant with the true paths, the amplifiers and the noise of the microphones.
     n_taps : int
         Length of the estimate.
     duration_s : float
         Duration of the run in s; in turn, of each loudspeaker's run.
     rng : int or numpy.random.Generator
         Seed or generator of excitation and sensor noise.
-    fs : float, optional
-        Sampling rate in Hz, needed for a tap array.
     excitation : {"white", "sweep"}, default "white"
         Gaussian white noise, or a sine whose frequency rises exponentially from fs/1000 to fs/2.
     level : float, default 1.0
         Root mean square of the excitation. A sweep peaks at ``sqrt(2) * level``.
-    amplifier : callable, or sequence of J callables or None, optional
-        Maps the signal before the amplifier, (n,), to that after it; by default linear. One is used for all
-        loudspeakers.
-    sensor_noise_std : float, default 0.0
-        Standard deviation of the noise of the microphones.
     regularization : float, default 1e-5
         As in `estimate_path`.
     frequencies_hz : array_like, shape (n_frequencies,), optional
@@ -376,31 +366,30 @@ def identify_secondary_path(
     Raises
     ------
     TypeError, ValueError
-        If an argument is out of range, the run is too short, the amplifier changes the shape of the signal, or a path
-        is silent.
+        If an argument is out of range, the run is too short, or a path is silent.
 
     Examples
     --------
-    >>> from kfopc_filterpy import bandpass_path
-    >>> result = identify_secondary_path(
-    ...     bandpass_path(32), n_taps=32, duration_s=1.0, rng=1, sensor_noise_std=0.01
-    ... )
+    >>> from kfopc_filterpy import Plant, bandpass_path
+    >>> plant = Plant(bandpass_path(32, fs=16000), sensor_noise_std=0.01)
+    >>> result = identify_secondary_path(plant, n_taps=32, duration_s=1.0, rng=1)
     >>> result.misalignment_db < -40
     True
 
     Two loudspeakers and two microphones, at once:
 
     >>> paths = [[[0.0, 1.0, 0.2], [0.0, 0.0, 0.5]], [[0.0, 0.0, 0.4], [0.0, 0.9, 0.1]]]
-    >>> settings = dict(n_taps=3, duration_s=1.0, rng=1, fs=8000.0, sensor_noise_std=0.01)
-    >>> result = identify_secondary_path(paths, **settings, loudspeakers="at once")
+    >>> plant = Plant(paths, fs=8000, sensor_noise_std=0.01)
+    >>> result = identify_secondary_path(plant, n_taps=3, duration_s=1.0, rng=1, loudspeakers="at once")
     >>> result.taps.shape, bool(result.misalignment_db.max() < -30)
     ((2, 2, 3), True)
     """
-    several = is_path_matrix(secondary_path)
-    true, fs = sampled_path_matrix(secondary_path, fs, "secondary_path", SECONDARY_AXES)
+    as_plant(plant).require_constant("identify_secondary_path")
+    true, fs = plant.secondary, plant.fs
+    several = true.shape[:2] != (1, 1)
     for k, j in np.argwhere(~np.any(true, axis=2)):
         raise ValueError(
-            f"secondary_path[{k}][{j}] must not be all zeros: an error relative to it is undefined; leave out the "
+            f"secondary path {k}, {j} must not be all zeros: an error relative to it is undefined; leave out the "
             "loudspeaker if it is unplugged, or the microphone if it is dead"
         )
     K, J, _ = true.shape
@@ -414,9 +403,9 @@ def identify_secondary_path(
         raise ValueError(f"duration_s must be at least {needed / fs:.3g} s for {n_taps} taps, got {duration_s:g}")
     generator = as_generator(rng)
     sent = np.array([_excitation(excitation, n_samples, fs, as_positive(level, "level"), generator) for _ in range(J)])
-    received = _through(sent, amplifier_of_each(amplifier, J, "signal"), true)  # (J, K, n_samples)
+    received = _through(sent, plant.amplifiers, true)  # (J, K, n_samples)
     received = received if in_turn else received.sum(axis=0)
-    received += as_nonnegative(sensor_noise_std, "sensor_noise_std") * generator.standard_normal(received.shape)
+    received += plant.sensor_noise_std * generator.standard_normal(received.shape)
     if not several:
         sent, received = sent[0], received.reshape(-1)
 
@@ -444,16 +433,13 @@ def _excitation(kind: str, n_samples: int, fs: float, level: float, rng: np.rand
     return np.sqrt(2) * level * chirp(t, fs / 1000, n_samples / fs, fs / 2, method="logarithmic", phi=-90)
 
 
-def _through(sent: np.ndarray, amplifiers: list[Any], paths: np.ndarray) -> np.ndarray:
+def _through(sent: np.ndarray, amplifiers: Sequence[Any], paths: np.ndarray) -> np.ndarray:
     """Return what each loudspeaker alone adds to each microphone, (J, K, n_samples)."""
     from scipy.signal import lfilter
 
     received = np.empty((len(sent), len(paths), sent.shape[1]))
     for j, amplifier in enumerate(amplifiers):
-        amplified = sent[j]
-        if amplifier is not None:
-            # A copy, so that an amplifier that works in place does not change the excitation.
-            amplified = as_signal(amplifier(sent[j].copy()), "amplifier(excitation)", length=sent.shape[1])
+        amplified = amplified_signal(amplifier, sent[j])
         for k, row in enumerate(paths):
             received[j, k] = lfilter(row[j], 1.0, amplified)
     return received

@@ -27,7 +27,7 @@ def bandpass_path(
     n_taps: int,
     band: tuple[float, float] = (20.0, 5000.0),
     *,
-    fs: float = 16000.0,
+    fs: float,
     window: str | float | tuple[str, float] | tuple[str, float, float] = "hamming",
 ) -> control.TransferFunction:
     """Design a linear-phase band-pass path, the path model of the paper's simulations.
@@ -42,8 +42,8 @@ def bandpass_path(
     band : (float, float), default (20.0, 5000.0)
         Pass band (low, high) in Hz. ``low = 0`` gives a low-pass; ``high = fs/2`` gives a high-pass, which needs an odd
         `n_taps`.
-    fs : float, default 16000
-        Sampling rate in Hz.
+    fs : float
+        Sample rate in Hz; the paper's is 16000.
     window : str or tuple, default "hamming"
         Any window that `scipy.signal.get_window` knows.
 
@@ -60,7 +60,7 @@ def bandpass_path(
     Examples
     --------
     >>> from kfopc_filterpy.paths import path_taps
-    >>> path = bandpass_path(32)
+    >>> path = bandpass_path(32, fs=16000)
     >>> path.dt, path_taps(path).size
     (6.25e-05, 32)
     """
@@ -242,8 +242,8 @@ def path_taps(path: PathModel, *, fs: float | None = None, n_taps: int | None = 
     if taps is None:
         if n_taps is None:
             raise ValueError(
-                f"n_taps must be given: {name} has an infinite impulse response; pass path_taps(system, n_taps=...) "
-                "to functions that take only taps or FIR systems"
+                f"{name} has an infinite impulse response: say how many taps of it to compute, Plant(..., n_path=...), or "
+                "pass path_taps(system, n_taps=...) to functions that take only taps or FIR systems"
             )
         taps = _infinite_response(path, 2 * n_taps, name)
     if not np.all(np.isfinite(taps)):
@@ -253,7 +253,7 @@ def path_taps(path: PathModel, *, fs: float | None = None, n_taps: int | None = 
     lost, energy = np.sum(taps[n_taps:] ** 2), np.sum(taps**2)
     if lost > _TRUNCATION_CUT * energy:
         raise ValueError(
-            f"n_taps = {n_taps} cuts off {10 * np.log10(lost / energy):.1f} dB of the energy of {name}, "
+            f"{n_taps} taps cut off {10 * np.log10(lost / energy):.1f} dB of the energy of {name}, "
             "more than -60 dB: its response has not decayed; use more taps"
         )
     return np.pad(taps[:n_taps], (0, max(n_taps - taps.size, 0)))

@@ -30,9 +30,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import minimum_phase, windows
 
-from .._types import PathModels
+from .._types import Secondary
 from .._validate import as_nonnegative, as_real_array, require_finite
-from .path_matrix import secondary_paths
+from ..plant import estimated_secondary
 
 N_FREQUENCIES = 257  # from 0 to fs/2
 OMEGA = np.linspace(0.0, np.pi, N_FREQUENCIES)
@@ -121,7 +121,7 @@ class PathTolerance:
 Uncertainty: TypeAlias = PathTolerance | float | ArrayLike
 
 
-def path_uncertainty(uncertainty: Uncertainty | None, secondary_path: PathModels) -> np.ndarray:
+def path_uncertainty(uncertainty: Uncertainty | None, secondary: Secondary) -> np.ndarray:
     """Return the largest relative error of a secondary path over frequency.
 
     Parameters
@@ -129,8 +129,8 @@ def path_uncertainty(uncertainty: Uncertainty | None, secondary_path: PathModels
     uncertainty : PathTolerance, float or array_like, optional
         Tolerances; or one relative error for all frequencies; or its values at evenly spaced frequencies from 0 to
         fs/2, (n_frequencies,); or measured paths, (M, n_taps) or (M, K, J, n_taps), whose largest distance from
-        `secondary_path` counts. None means no uncertainty.
-    secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
+        `secondary` counts. None means no uncertainty.
+    secondary : array_like, shape (n_path,) or (K, J, n_path), or control system
         Estimated secondary path.
 
     Returns
@@ -143,7 +143,7 @@ def path_uncertainty(uncertainty: Uncertainty | None, secondary_path: PathModels
     ------
     TypeError, ValueError
         An uncertainty that is negative, not finite, or none of the above; measured paths whose channels differ from
-        those of `secondary_path`.
+        those of `secondary`.
 
     Examples
     --------
@@ -153,7 +153,7 @@ def path_uncertainty(uncertainty: Uncertainty | None, secondary_path: PathModels
     >>> path_uncertainty(measured, [0.0, 1.0, 0.0])[[0, 128, 256]].round(2)
     array([0.  , 0.28, 0.4 ])
     """
-    estimate, _ = secondary_paths(secondary_path)
+    estimate, _ = estimated_secondary(secondary)
     stated = as_uncertainty(uncertainty)
     if stated is None:
         return np.zeros(N_FREQUENCIES)
@@ -169,16 +169,16 @@ def path_uncertainty(uncertainty: Uncertainty | None, secondary_path: PathModels
     return error
 
 
-def rms_relative_error(uncertainty: Uncertainty | None, secondary_path: PathModels) -> float:
+def rms_relative_error(uncertainty: Uncertainty | None, secondary: Secondary) -> float:
     """Return the root mean square of the relative error over the spectrum of a secondary path; 0 if it is exact."""
     stated = as_uncertainty(uncertainty)
     if stated is None or isinstance(stated, float):
         return stated or 0.0
-    paths, _ = secondary_paths(secondary_path)
+    paths, _ = estimated_secondary(secondary)
     weights = np.sum(np.abs(_response(paths)) ** 2, axis=(1, 2))
     weights = weights if np.any(weights > 0.0) else np.ones(N_FREQUENCIES)
     weights[[0, -1]] *= 0.5  # each other frequency stands for two of the whole circle
-    return float(np.sqrt(np.average(path_uncertainty(stated, secondary_path) ** 2, weights=weights)))
+    return float(np.sqrt(np.average(path_uncertainty(stated, secondary) ** 2, weights=weights)))
 
 
 def as_uncertainty(value: Uncertainty | None) -> PathTolerance | float | np.ndarray | None:
@@ -240,7 +240,7 @@ def _response(paths: np.ndarray) -> np.ndarray:
     return np.moveaxis(paths @ waves.T, -1, -3)
 
 
-def guard_filter(uncertainty: Uncertainty | None, secondary_path: PathModels) -> np.ndarray | None:
+def guard_filter(uncertainty: Uncertainty | None, secondary: Secondary) -> np.ndarray | None:
     """Return the filter W that guards a controller against an uncertainty, or None if it needs no guard.
 
     Parameters
@@ -248,7 +248,7 @@ def guard_filter(uncertainty: Uncertainty | None, secondary_path: PathModels) ->
     uncertainty : PathTolerance, float or array_like, optional
         Uncertainty of the secondary path, as of `path_uncertainty`. A tolerance allows more control than its
         relative error, because it limits the phase of the error, unless there are more microphones than loudspeakers.
-    secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
+    secondary : array_like, shape (n_path,) or (K, J, n_path), or control system
         Estimated secondary path.
 
     Returns
@@ -272,29 +272,29 @@ def guard_filter(uncertainty: Uncertainty | None, secondary_path: PathModels) ->
     >>> share[[64, 128, 160, 224]].round(2)  # at 1/8, 1/4, 5/16 and 7/16 of the sample rate
     array([1.  , 0.66, 0.56, 0.03])
     """
-    share = allowed_share(uncertainty, secondary_path)
+    share = allowed_share(uncertainty, secondary)
     stated: Any = uncertainty
     if np.all(share == 1.0) and np.ndim(stated) < 2:  # measured paths may differ from a later estimate
         return None
-    largest = np.minimum(path_uncertainty(uncertainty, secondary_path), LARGEST_ERROR)
+    largest = np.minimum(path_uncertainty(uncertainty, secondary), LARGEST_ERROR)
     share = np.maximum(share, np.minimum(LEAST_SHARE, LEAST_LOOP_GAIN / np.maximum(largest, 1.0)))
     penalty = np.maximum((1.0 - share) / share, SMALLEST_PENALTY)
-    loop_gain = LARGEST_LOOP_GAIN if _knows_phase(uncertainty, secondary_path) else LARGEST_LOOP_GAIN_OF_SIZE
+    loop_gain = LARGEST_LOOP_GAIN if _knows_phase(uncertainty, secondary) else LARGEST_LOOP_GAIN_OF_SIZE
     return _short_filter(penalty, largest / loop_gain - 1.0)
 
 
-def allowed_share(uncertainty: Uncertainty | None, secondary_path: PathModels) -> np.ndarray:
+def allowed_share(uncertainty: Uncertainty | None, secondary: Secondary) -> np.ndarray:
     """Return the part g of the control filter that an uncertainty allows, (257,), at evenly spaced frequencies to fs/2."""
-    paths, _ = secondary_paths(secondary_path)
-    if _knows_phase(uncertainty, secondary_path):
+    paths, _ = estimated_secondary(secondary)
+    if _knows_phase(uncertainty, secondary):
         limit = LARGEST_PHASE_DEG if paths.shape[1] == 1 else LARGEST_PHASE_OF_SEVERAL_DEG
         return uncertainty.share(OMEGA, largest_phase_deg=limit)
-    return 1.0 - np.minimum(path_uncertainty(uncertainty, secondary_path), 1.0) ** SHARPNESS
+    return 1.0 - np.minimum(path_uncertainty(uncertainty, secondary), 1.0) ** SHARPNESS
 
 
-def _knows_phase(uncertainty: Any, secondary_path: PathModels) -> TypeGuard[PathTolerance]:
+def _knows_phase(uncertainty: Any, secondary: Secondary) -> TypeGuard[PathTolerance]:
     """Return whether the phase of the error is limited, and errors at one microphone do not disturb another one."""
-    n_microphones, n_loudspeakers = secondary_paths(secondary_path)[0].shape[:2]
+    n_microphones, n_loudspeakers = estimated_secondary(secondary)[0].shape[:2]
     return isinstance(uncertainty, PathTolerance) and n_microphones <= n_loudspeakers
 
 

@@ -24,6 +24,8 @@ from . import style
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from ..plant import Plant
+
 
 def _named(paths: Any, single: str = "path") -> dict[str, Any]:
     """Return paths, or what belongs to paths, by name; a `single` one is called so."""
@@ -84,7 +86,7 @@ def plot_bode(
     --------
     >>> import matplotlib.pyplot as plt
     >>> from kfopc_filterpy import bandpass_path
-    >>> primary, secondary = bandpass_path(128), bandpass_path(32)
+    >>> primary, secondary = bandpass_path(128, fs=16000), bandpass_path(32, fs=16000)
     >>> magnitude, phase = plot_bode({"P": primary, "S": secondary})
     >>> magnitude.get_ylabel(), phase.get_xlabel()
     ('Magnitude (dB)', 'Frequency (Hz)')
@@ -138,7 +140,7 @@ def plot_impulse_responses(
     --------
     >>> import matplotlib.pyplot as plt
     >>> from kfopc_filterpy import bandpass_path
-    >>> primary, secondary = bandpass_path(128), bandpass_path(32)
+    >>> primary, secondary = bandpass_path(128, fs=16000), bandpass_path(32, fs=16000)
     >>> ax = plot_impulse_responses({"P": primary, "S": secondary})
     >>> ax.get_xlabel(), ax.get_legend_handles_labels()[1]
     ('Time (ms)', ['P', 'S'])
@@ -182,7 +184,7 @@ def plot_group_delay(
     --------
     >>> import matplotlib.pyplot as plt
     >>> from kfopc_filterpy import bandpass_path
-    >>> primary, secondary = bandpass_path(128), bandpass_path(32)
+    >>> primary, secondary = bandpass_path(128, fs=16000), bandpass_path(32, fs=16000)
     >>> ax = plot_group_delay({"P": primary, "S": secondary})
     >>> ax.get_ylabel()
     'Group delay (ms)'
@@ -199,9 +201,7 @@ def plot_group_delay(
     return style.frequency_axis(ax, frequencies)
 
 
-def plot_causality_margin(
-    primary: PathModel, secondary: PathModel, *, fs: float | None = None, ax: Axes | None = None
-) -> Axes:
+def plot_causality_margin(plant: Plant, *, ax: Axes | None = None) -> Axes:
     """Draw the impulse responses of both paths, with their energy onsets and the margin between them.
 
     With several channels, draw the margin of each microphone and loudspeaker as a table. A frame marks the pair that
@@ -209,12 +209,8 @@ def plot_causality_margin(
 
     Parameters
     ----------
-    primary : control.TransferFunction or array_like, shape (n_taps,) or (K, I, n_taps)
-        Primary paths with finite impulse responses.
-    secondary : control.TransferFunction or array_like, shape (n_taps,) or (K, J, n_taps)
-        Secondary paths with finite impulse responses.
-    fs : float, optional
-        Sampling rate in Hz, needed for tap arrays.
+    plant : Plant
+        Plant with a primary path.
     ax : matplotlib.axes.Axes, optional
         Axes to draw into, by default new ones.
 
@@ -231,19 +227,18 @@ def plot_causality_margin(
     Examples
     --------
     >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import bandpass_path
-    >>> primary, secondary = bandpass_path(128), bandpass_path(32)
-    >>> ax = plot_causality_margin(primary, secondary)
+    >>> from kfopc_filterpy import Plant, bandpass_path
+    >>> ax = plot_causality_margin(Plant(bandpass_path(32, fs=16000), bandpass_path(128, fs=16000)))
     >>> ax.texts[-1].get_text().strip()
     'margin 2.81 ms (45 samples)'
     >>> plt.close(ax.figure)
     """
-    margin = analysis.causality_margin(primary, secondary, fs=fs)
+    margin = analysis.causality_margin(plant)
     ax = style.new_axes(ax)
     if np.ndim(margin.secondary_onset_s) == 2:
         _draw_margins(margin, ax)
     else:
-        _draw_onsets(margin, {"Primary path P": primary, "Secondary path S": secondary}, ax)
+        _draw_onsets(margin, {"Primary path P": plant.primary[0, 0], "Secondary path S": plant.secondary[0, 0]}, ax)  # type: ignore[index]
     return ax
 
 
@@ -251,7 +246,7 @@ def _draw_onsets(margin: analysis.CausalityMargin, paths: Mapping[str, Any], ax:
     """Draw a primary and a secondary path with their onsets."""
     onsets = (1e3 * margin.primary_onset_s, 1e3 * margin.secondary_onset_s)
     for i, (label, path) in enumerate(paths.items()):
-        taps = path_taps(path)
+        taps = path
         ax.plot(1e3 * np.arange(taps.size) / margin.fs, taps / np.abs(taps).max(), label=label, **style.line_style(i))
         ax.axvline(onsets[i], color=style.line_style(i)["color"], linewidth=0.8)
     ax.annotate("", (onsets[0], -1.2), (onsets[1], -1.2), arrowprops={"arrowstyle": "<->", "color": style.MARK})
@@ -324,7 +319,7 @@ def plot_secondary_path_gain(
     --------
     >>> import matplotlib.pyplot as plt
     >>> from kfopc_filterpy import bandpass_path
-    >>> ax = plot_secondary_path_gain(bandpass_path(32), band=(200.0, 2000.0))
+    >>> ax = plot_secondary_path_gain(bandpass_path(32, fs=16000), band=(200.0, 2000.0))
     >>> ax.get_legend_handles_labels()[1][1]
     '$G_s$, 200 to 2000 Hz: -0.1 dB'
     >>> plt.close(ax.figure)
@@ -384,7 +379,7 @@ def plot_phase_error(
     >>> import matplotlib.pyplot as plt
     >>> from kfopc_filterpy import bandpass_path
     >>> from kfopc_filterpy.paths import perturbed_path
-    >>> path = bandpass_path(32)
+    >>> path = bandpass_path(32, fs=16000)
     >>> ax = plot_phase_error(path, {"one sample late": perturbed_path(path, delay_samples=1)})
     >>> ax.get_legend_handles_labels()[1]
     ['one sample late', 'Stability bound ±90°']
@@ -436,10 +431,12 @@ def plot_required_rated_power(
     --------
     >>> import matplotlib.pyplot as plt
     >>> import numpy as np
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.bounds import wiener_solution
     >>> rng = np.random.default_rng(0)
     >>> x = rng.standard_normal(4000)
-    >>> solution = wiener_solution(x, 0.5 * x + 0.05 * rng.standard_normal(4000), [1.0], n_taps=4)
+    >>> d = 0.5 * x + 0.05 * rng.standard_normal(4000)
+    >>> solution = wiener_solution(x, Plant([1.0], fs=16000), n_taps=4, disturbance=d)
     >>> ax = plot_required_rated_power(solution, rated_power=0.1)
     >>> ax.get_legend_handles_labels()[1][1:]
     ['Wiener filter unconstrained: 20.0 dB', 'Rated power 0.1']
@@ -489,9 +486,11 @@ def plot_modelling_error(
     Examples
     --------
     >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import bandpass_path
+    >>> from kfopc_filterpy import Plant, bandpass_path
     >>> from kfopc_filterpy.paths import identify_secondary_path
-    >>> result = identify_secondary_path(bandpass_path(32), n_taps=32, duration_s=1.0, rng=1, sensor_noise_std=0.01)
+    >>> result = identify_secondary_path(
+    ...     Plant(bandpass_path(32, fs=16000), sensor_noise_std=0.01), n_taps=32, duration_s=1.0, rng=1
+    ... )
     >>> ax = plot_modelling_error({"32 taps": result})
     >>> ax.get_ylabel()
     'Modelling error (dB)'

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ..loop.result import SimulationResult
+
 
 def plot_weight_history(results: Results, *, tap: int | tuple[int, int, int], ax: Axes | None = None) -> Axes:
     """Draw the history of one weight of each control filter (the paper's Fig. 5 d).
@@ -64,10 +66,10 @@ def plot_weight_history(results: Results, *, tap: int | tuple[int, int, int], ax
     Examples
     --------
     >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy import Plant, fx_lms, simulate
     >>> from kfopc_filterpy.signals import tone
-    >>> x, controller = tone(400.0, 0.1, fs=16000), FxLMS(8, [1.0], step_size=0.01)
-    >>> result = simulate(controller, x, secondary_path=[1.0], primary_path=[0.5], record_weights_every=16)
+    >>> x, controller = tone(400.0, 0.1, fs=16000), fx_lms(8, [1.0], step_size=0.01)
+    >>> result = simulate(controller, x, Plant([1.0], [0.5], fs=16000), record_weights_every=16)
     >>> ax = plot_weight_history(result, tap=3)
     >>> ax.get_ylabel()
     'Weight 3 of the control filter'
@@ -138,10 +140,10 @@ def plot_nse(
     Examples
     --------
     >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy import Plant, fx_lms, simulate
     >>> from kfopc_filterpy.signals import tone
     >>> x = tone(400.0, 0.1, fs=16000)
-    >>> result = simulate(FxLMS(8, [1.0], step_size=0.01), x, secondary_path=[1.0], primary_path=[0.5])
+    >>> result = simulate(fx_lms(8, [1.0], step_size=0.01), x, Plant([1.0], [0.5], fs=16000))
     >>> ax = plot_nse(result, time_axis="log")
     >>> ax.get_ylabel()
     'Normalised squared error (dB)\\nover 5 ms'
@@ -224,10 +226,10 @@ def plot_output_power(
     Examples
     --------
     >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy import Plant, fx_lms, simulate
     >>> from kfopc_filterpy.signals import tone
     >>> x = tone(400.0, 0.1, fs=16000)
-    >>> result = simulate(FxLMS(8, [1.0], step_size=0.01), x, secondary_path=[1.0], primary_path=[0.5])
+    >>> result = simulate(fx_lms(8, [1.0], step_size=0.01), x, Plant([1.0], [0.5], fs=16000))
     >>> ax = plot_output_power(result, rated_power=0.2, window_s=0.02)
     >>> ax.get_legend_handles_labels()[1]
     ['FxLMS', 'Rated power 0.2']
@@ -287,10 +289,10 @@ def plot_constraint_factor(results: Results, *, channel: int | None = None, ax: 
     Examples
     --------
     >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import kf_opc, simulate
+    >>> from kfopc_filterpy import Plant, kf_opc, simulate
     >>> from kfopc_filterpy.signals import tone
-    >>> controller = kf_opc(8, [1.0], rated_power=0.1, state_noise=1e-9, measurement_noise=1e-3)
-    >>> result = simulate(controller, tone(400.0, 0.1, fs=16000), secondary_path=[1.0], primary_path=[1.0])
+    >>> controller = kf_opc(8, [1.0], rated_power=0.1, fs=16000, state_noise=1e-9, measurement_noise=1e-3)
+    >>> result = simulate(controller, tone(400.0, 0.1, fs=16000), Plant([1.0], [1.0], fs=16000))
     >>> ax = plot_constraint_factor(result)
     >>> ax.get_ylabel()
     'Constraint factor α'
@@ -421,3 +423,29 @@ def _over_time(ax: Axes, shown: list[Curve], label: str) -> Axes:
     """Label axes with a quantity over the time of whole runs, and return them."""
     ax.set_xlim(0, max(curve.run.n_samples / curve.run.fs for curve in shown))
     return labelled(ax, xlabel="Time (s)", ylabel=label)
+
+
+def plot_run(result: SimulationResult) -> Figure:
+    """Return a figure of one run: its normalised squared error and its output power over time, and its spectra.
+
+    Parameters
+    ----------
+    result : SimulationResult
+        The run. With several microphones, errors and spectra are those of the first.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure with three axes.
+    """
+    from matplotlib.figure import Figure
+
+    from .signals import plot_error_spectra
+
+    figure = Figure(figsize=(8.0, 8.0), layout="constrained")
+    level, power, spectra = figure.subplots(3)
+    first = 0 if result.error.ndim > 1 else None
+    plot_nse(result, channel=first, ax=level)
+    plot_output_power(result, ax=power)
+    plot_error_spectra(result, channel=first, ax=spectra)
+    return figure

@@ -69,10 +69,10 @@ def plot_error_spectra(
     Examples
     --------
     >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy import Plant, fx_lms, simulate
     >>> from kfopc_filterpy.signals import tone
     >>> x = tone(400.0, 0.2, fs=16000)
-    >>> result = simulate(FxLMS(8, [1.0], step_size=0.01), x, secondary_path=[1.0], primary_path=[0.5])
+    >>> result = simulate(fx_lms(8, [1.0], step_size=0.01), x, Plant([1.0], [0.5], fs=16000))
     >>> ax = plot_error_spectra(result, band=(0.0, 4000.0))
     >>> ax.get_xlabel(), ax.get_legend_handles_labels()[1]
     ('Frequency (Hz)', ['Disturbance', 'FxLMS'])
@@ -140,10 +140,10 @@ def plot_anti_noise(
     Examples
     --------
     >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy import Plant, fx_lms, simulate
     >>> from kfopc_filterpy.signals import tone
     >>> x = tone(400.0, 0.1, fs=16000)
-    >>> result = simulate(FxLMS(8, [1.0], step_size=0.01), x, secondary_path=[1.0], primary_path=[0.5])
+    >>> result = simulate(fx_lms(8, [1.0], step_size=0.01), x, Plant([1.0], [0.5], fs=16000))
     >>> ax = plot_anti_noise(result, span_s=(0.09, 0.1))
     >>> ax.get_xlabel()
     'Time (ms)'
@@ -194,11 +194,11 @@ def plot_amplifier_output(
     Examples
     --------
     >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import FxLMS, HardClipAmplifier, simulate
+    >>> from kfopc_filterpy import HardClipAmplifier, Plant, fx_lms, simulate
     >>> from kfopc_filterpy.signals import tone
     >>> x, clip = tone(400.0, 0.1, fs=16000), HardClipAmplifier(0.3)
-    >>> controller = FxLMS(8, [1.0], step_size=0.01)
-    >>> result = simulate(controller, x, secondary_path=[1.0], primary_path=[0.5], amplifier=clip)
+    >>> controller = fx_lms(8, [1.0], step_size=0.01)
+    >>> result = simulate(controller, x, Plant([1.0], [0.5], amplifier=clip, fs=16000))
     >>> ax = plot_amplifier_output(result, span_s=(0.09, 0.1), limit=0.3)
     >>> ax.get_legend_handles_labels()[1]
     ['FxLMS', 'FxLMS before the amplifier', 'Limit ±0.3']
@@ -271,10 +271,10 @@ def plot_disturbance_and_anti_noise(
     Examples
     --------
     >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy import Plant, fx_lms, simulate
     >>> from kfopc_filterpy.signals import band_limited_noise
     >>> x = band_limited_noise((200.0, 2000.0), 1.1, fs=16000, rng=0)
-    >>> result = simulate(FxLMS(8, [1.0], step_size=0.01), x, secondary_path=[1.0], primary_path=[0.5])
+    >>> result = simulate(fx_lms(8, [1.0], step_size=0.01), x, Plant([1.0], [0.5], fs=16000))
     >>> ax = plot_disturbance_and_anti_noise(result, span_s=(1.0, 1.02), band=(200.0, 2000.0))
     >>> ax.get_legend().get_title().get_text().splitlines()[0]
     'Anti-noise over disturbance, 200 to 2000 Hz: coherence 1.0000, gain 1.000'

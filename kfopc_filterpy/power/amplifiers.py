@@ -15,7 +15,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validate import as_positive
+from .._validate import as_positive, as_returned
 from ..core.calls import amplify_all
 from ..core.run_loop import HARD_CLIP, LINEAR, SOFT_SATURATION
 
@@ -123,17 +123,34 @@ def compiled_model(amplifier: Amplifier | None) -> np.ndarray | None:
     return amplifier.model if isinstance(amplifier, models) and type(amplifier) in models else None
 
 
+def amplified_sample(amplifier: Amplifier, y: float) -> float:
+    """Return a sample after a user's amplifier; ValueError if it is not finite."""
+    played = as_returned(amplifier(y), "amplifier")
+    if not math.isfinite(played):
+        raise ValueError(f"amplifier must return a finite number, got {played} for {y}")
+    return played
+
+
+def amplified_signal(amplifier: Amplifier | None, y: np.ndarray) -> np.ndarray:
+    """Return a signal, (n_samples,), after an amplifier; a user's function gets it sample by sample."""
+    if amplifier is None:
+        return y
+    if compiled_model(amplifier) is not None:
+        return np.asarray(amplifier(y))
+    return np.array([amplified_sample(amplifier, sample) for sample in y.tolist()])
+
+
 def _each(amplifier: Any, n_loudspeakers: int) -> list[Any]:
     """Return what is given for each loudspeaker: a sequence, or one for all."""
     return list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
 
 
-def amplifier_of_each(amplifier: Any, n_loudspeakers: int, of: str = "sample") -> list[Any]:
+def amplifier_of_each(amplifier: Any, n_loudspeakers: int) -> list[Any]:
     """Return for each loudspeaker a function that stands for its amplifier, or None, from one for all or one for each."""
     each = _each(amplifier, n_loudspeakers)
     if len(each) != n_loudspeakers or not all(one is None or callable(one) for one in each):
         for_each = f", or one for each of the {n_loudspeakers} loudspeakers" if n_loudspeakers > 1 else ""
-        raise TypeError(f"amplifier must be a function of a {of}{for_each}, or None, got {amplifier!r}")
+        raise TypeError(f"amplifier must be a function of a sample{for_each}, or None, got {amplifier!r}")
     return each
 
 

@@ -53,10 +53,10 @@ class OutputPowerConstraint:
     ----------
     rated_power : float
         Rated output power :math:`\rho_o` of the amplifier, the mean square of the control signal.
+    fs : float
+        Sample rate in Hz.
     secondary_path_gain : float, optional
         Power gain :math:`G_s`; by default estimated as E[x'^2]/E[x^2] (eq. 11).
-    fs : float, default 16000
-        Sample rate in Hz.
     memory_s : float, default 0.5
         Memory of the power estimates in seconds: the time constant of the exponential window, or the length
         of the sliding one.
@@ -71,7 +71,7 @@ class OutputPowerConstraint:
     Examples
     --------
     >>> from kfopc_filterpy import OutputPowerConstraint
-    >>> constraint = OutputPowerConstraint(rated_power=1.0, secondary_path_gain=1.0)
+    >>> constraint = OutputPowerConstraint(rated_power=1.0, fs=16000, secondary_path_gain=1.0)
     >>> constraint.advance(2.0)  # a disturbance of power 4, a rated power of 1
     0.5
     >>> constraint.disturbance_power
@@ -82,8 +82,8 @@ class OutputPowerConstraint:
         self,
         rated_power: float,
         *,
+        fs: float,
         secondary_path_gain: float | None = None,
-        fs: float = DEFAULT_FS,
         memory_s: float = DEFAULT_MEMORY_S,
         window: str = "exponential",
     ) -> None:
@@ -107,8 +107,8 @@ class OutputPowerConstraint:
         """Return a constraint with the same settings and no samples yet; `rated_power` replaces the rated power."""
         return OutputPowerConstraint(
             self.rated_power if rated_power is None else rated_power,
-            secondary_path_gain=self._given_gain,
             fs=self.fs,
+            secondary_path_gain=self._given_gain,
             memory_s=self.memory_s,
             window=self.window,
         )

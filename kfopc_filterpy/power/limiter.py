@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 from .._validate import as_number, as_positive, as_signal
 from ..core.calls import limit, limit_all
 from ..core.library import constant
-from .constraint import DEFAULT_FS
 
 DEFAULT_WINDOW_S = 0.1
 LONGEST_WINDOW = 10**7  # samples; the margin for rounding is then 2e-9 of the budget
@@ -64,7 +63,7 @@ class OutputLimiter:
     ----------
     rated_power : float
         Rated output power :math:`\rho_o` of the amplifier, a mean square: the average (thermal) rating.
-    fs : float, default 16000
+    fs : float
         Sample rate in Hz.
     window_s : float, default 0.1
         Averaging time of the rating in seconds, 1 to 10^7 samples.
@@ -101,7 +100,7 @@ class OutputLimiter:
     >>> import numpy as np
     >>> from kfopc_filterpy import OutputLimiter
     >>> from kfopc_filterpy.signals import tone
-    >>> limiter = OutputLimiter(rated_power=1.0)
+    >>> limiter = OutputLimiter(rated_power=1.0, fs=16000)
     >>> limiter(0.5)
     0.5
     >>> limiter.reset()
@@ -115,7 +114,7 @@ class OutputLimiter:
         self,
         rated_power: float,
         *,
-        fs: float = DEFAULT_FS,
+        fs: float,
         window_s: float = DEFAULT_WINDOW_S,
         amplitude_limit: float | None = None,
     ) -> None:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import ChangingPaths, Seed
-from .._validate import as_channels, as_choice, as_count, as_positive
+from .._types import Seed
+from .._validate import as_choice, as_count
 from ..controllers.channel_samples import through
-from ..loop.inputs import SensorNoise, channel_disturbances
-from ..loop.schedule import Schedule, path_schedule, steps
-from ..paths.path_matrix import is_path_matrix, path_matrix, secondary_paths
-from ..power.amplifiers import Amplifiers, amplifier_of_each
+from ..loop.inputs import SensorNoise
+from ..plant import Plant, Schedule, as_plant
+from ..power.amplifiers import amplified_signal
 
 
 class Block(NamedTuple):
@@ -73,34 +71,20 @@ class Interface(Protocol):
 
 
 class SimulatedInterface:
-    """A plant model that behaves like a sound card: blocks, and a delay between writing and playing.
-
-    Paths may change during the run, as in `simulate`: give pairs (time in s, path).
+    """A plant that behaves like a sound card: blocks, and a delay between writing and playing.
 
     Parameters
     ----------
     reference : array_like, shape (n_samples,) or (I, n_samples), or None
         Reference x, the noise. Without a reference microphone, None: then give a `disturbance`.
-    secondary_path : array_like or control.TransferFunction
-        True secondary path s, or paths (K, J, n_taps), without the delay of the interface.
-    primary_path : array_like or control.TransferFunction, optional
-        Path from the reference to the error microphone, or paths (K, I, n_taps).
+    plant : Plant
+        Plant without the delay of the interface. It may change during the run, see `Plant.changed_at`.
     disturbance : array_like, shape (n_samples,) or (K, n_samples), optional
-        Disturbance d, in place of `primary_path`.
-    fs : float, default 16000
-        Sample rate in Hz.
+        Disturbance d, in place of the plant's primary path.
     block : int, default 64
         Samples of a block.
     latency : int, optional
         Samples from a sample's reading to the playing of its control signal, at least a block; by default two blocks.
-    amplifier : callable, optional
-        Amplifier model or function of a sample, or a sequence with one for each loudspeaker; by default linear.
-    feedback_path : array_like or control.TransferFunction, optional
-        Acoustic feedback from the amplifier to the reference microphone, or paths (I, J, n_taps).
-    crossfade_s : float, default 0
-        Time in s from the beginning to the end of a change of a path; 0 switches at once.
-    sensor_noise_std : float, default 0
-        Standard deviation of white noise at each error microphone.
     rng : int or numpy.random.Generator, optional
         Seed of the sensor noise; required if there is any.
     clock : {"free", "real"}, default "free"
@@ -109,91 +93,68 @@ class SimulatedInterface:
 
     Attributes
     ----------
-    total_secondary_path : ndarray, shape (latency + n_taps,) or (K, J, latency + n_taps)
-        Secondary path at the beginning as a controller sees it, the delay of the interface included.
+    total_plant : Plant
+        Plant at the beginning as a controller sees it, with the delay of the interface in its secondary path.
     disturbance : ndarray, shape (K, n_samples)
         Disturbance at the error microphones.
 
     Raises
     ------
     TypeError, ValueError
-        Signals or paths that do not fit each other; a latency below a block; both or neither of `primary_path` and
-        `disturbance`, or a primary path without a reference.
+        Signals that do not fit the plant; a latency below a block; neither a primary path nor a disturbance.
 
     Examples
     --------
     >>> import numpy as np
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.realtime import SimulatedInterface
     >>> noise = np.random.default_rng(0).standard_normal(1000)
-    >>> plant = SimulatedInterface(noise, [0.0, 0.8], primary_path=[0.0, 0.0, 0.5], block=50)
-    >>> plant.start()
-    >>> first = plant.read()
+    >>> interface = SimulatedInterface(noise, Plant([0.0, 0.8], [0.0, 0.0, 0.5], fs=16000), block=50)
+    >>> interface.start()
+    >>> first = interface.read()
     >>> first.references.shape, first.errors.shape
     ((1, 50), (1, 50))
-    >>> plant.total_secondary_path.shape  # 100 zeros, then the path
-    (102,)
+    >>> interface.total_plant  # 100 zeros, then the path
+    <Plant at 16000 Hz: secondary path of 102 taps, primary path of 3 taps>
     """
 
     def __init__(
         self,
         reference: ArrayLike | None,
-        secondary_path: ChangingPaths,
+        plant: Plant,
         *,
-        primary_path: ChangingPaths | None = None,
         disturbance: ArrayLike | None = None,
-        fs: float = 16000.0,
         block: int = 64,
         latency: int | None = None,
-        amplifier: Amplifiers = None,
-        feedback_path: ChangingPaths | None = None,
-        crossfade_s: float = 0.0,
-        sensor_noise_std: float = 0.0,
         rng: Seed | None = None,
         clock: str = "free",
     ) -> None:
-        self.fs = as_positive(fs, "fs", unit="Hz")
+        self.fs = as_plant(plant).fs
         self.block = as_count(block, "block")
         self.latency = 2 * self.block if latency is None else as_count(latency, "latency")
         if self.latency < self.block:
             raise ValueError(f"latency must be at least a block, {self.block} samples, got {self.latency}")
         self.clock = as_choice(clock, "clock", ("free", "real"))
-        self._sensor_noise = SensorNoise(sensor_noise_std, rng)
-        if reference is not None:
-            self._x = np.atleast_2d(as_channels(reference, "reference"))
-        elif disturbance is not None:
-            self._x = np.empty((0, as_channels(disturbance, "disturbance").shape[-1]))
-        else:
-            raise ValueError("without a reference give disturbance=, what the error microphones hear")
+        self._sensor_noise = SensorNoise(plant.sensor_noise_std, rng)
+        self._x, self.disturbance = plant.signals(reference, disturbance)
         self.n_references = len(self._x)
-
-        def schedule(paths: Any, name: str, read: Callable[[Any], np.ndarray]) -> Schedule:
-            return path_schedule(paths, name, read, self.n_samples, self.fs, crossfade_s)
-
-        secondary = schedule(secondary_path, "secondary_path", lambda paths: secondary_paths(paths, fs=self.fs)[0])
-        self.n_microphones, self.n_loudspeakers, _ = secondary.values[0].shape
-        total = np.pad(secondary.values[0], ((0, 0), (0, 0), (self.latency, 0)))
-        several = any(is_path_matrix(path) for _, path in steps(secondary_path, "secondary_path"))
-        self.total_secondary_path = total if several else total[0, 0]
-        self.disturbance = channel_disturbances(
-            self._x, primary_path, disturbance, self.fs, self.n_microphones, crossfade_s
+        self.n_microphones, self.n_loudspeakers = plant.n_microphones, plant.n_loudspeakers
+        begin = plant.at(0.0)
+        self.total_plant = Plant(
+            np.pad(begin.secondary, ((0, 0), (0, 0), (self.latency, 0))),
+            begin.primary,
+            feedback=begin.feedback,
+            amplifier=begin.amplifiers,
+            fs=self.fs,
+            sensor_noise_std=begin.sensor_noise_std,
         )
-        self._amplifiers = amplifier_of_each(amplifier, self.n_loudspeakers)
-        self._secondary = _Paths(secondary)
-        self._feedback = None
-        if feedback_path is not None:
-            self._feedback = _Paths(schedule(feedback_path, "feedback_path", self._read_feedback))
+        self._amplifiers = plant.schedule("amplifier")
+        self._secondary = _Paths(plant.schedule("secondary"))
+        feedback = plant.schedule("feedback")
+        self._feedback = None if feedback.values[0] is None else _Paths(feedback)
         self._queue = np.zeros((self.n_loudspeakers, self.latency))  # written, not yet played
         self._done, self._began = 0, 0.0
         self.blocks_can_repeat = False  # simulated noise may be exactly periodic
-
-    def _read_feedback(self, paths: Any) -> np.ndarray:
-        feedback, _ = path_matrix(paths, fs=self.fs, name="feedback_path")
-        if feedback.shape[:2] != (self.n_references, self.n_loudspeakers):
-            raise ValueError(
-                f"feedback_path must lead from the {self.n_loudspeakers} loudspeakers to the {self.n_references} "
-                f"references, got paths {feedback.shape}"
-            )
-        return feedback
 
     @property
     def n_samples(self) -> int:
@@ -223,8 +184,7 @@ class SimulatedInterface:
         if now.stop > self.n_samples:
             return None
         y = self._queue[:, : self.block]
-        each = zip(self._amplifiers, y, strict=True)
-        y = np.array([signal if amplifier is None else amplifier(signal) for amplifier, signal in each])
+        y = np.array([amplified_signal(*each) for each in zip(self._amplifiers.at(self._done)[0], y, strict=True)])
         e = self.disturbance[:, now] - self._secondary(y)
         e += self._sensor_noise.take(*e.shape)
         x = self._x[:, now] + (0.0 if self._feedback is None else self._feedback(y))

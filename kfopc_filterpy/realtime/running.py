@@ -20,6 +20,7 @@ from ..bounds.prediction import predictor_reference
 from ..bounds.settings import SuggestedSettings, suggest_settings
 from ..controllers.base import Controller, listed
 from ..paths.identification import PathEstimate, estimate_path
+from ..plant import Plant
 from .faults import LARGEST
 from .health import Health
 from .interfaces import Interface
@@ -173,6 +174,11 @@ class IdentifiedPlant:
         return self.path.taps
 
     @property
+    def plant(self) -> Plant:
+        """Plant with the identified secondary path."""
+        return Plant(self.taps, fs=self.fs)
+
+    @property
     def uncertainty(self) -> np.ndarray:
         """Largest relative error of the path, (257,) from 0 to fs/2, for `secondary_path_uncertainty`."""
         return np.asarray(self.path.uncertainty)
@@ -183,7 +189,7 @@ class IdentifiedPlant:
         For one channel only. Without a reference microphone, the settings are those of a feedback controller.
         """
         x = self.references if self.references.size else predictor_reference(self.errors)
-        return suggest_settings(x, self.errors, self.taps, fs=self.fs, n_taps=n_taps)
+        return suggest_settings(x, self.plant, disturbance=self.errors, n_taps=n_taps)
 
 
 @dataclass
@@ -299,9 +305,10 @@ def measure_round_trip(
     Examples
     --------
     >>> import numpy as np
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.realtime import SimulatedInterface, measure_round_trip
-    >>> plant = SimulatedInterface(np.zeros(20000), [0.0, 0.0, 0.8], disturbance=np.zeros(20000), block=32)
-    >>> measure_round_trip(plant, level=0.1)  # two blocks of 32 samples, and two samples of the path
+    >>> interface = SimulatedInterface(np.zeros(20000), Plant([0.0, 0.0, 0.8], [0.0], fs=16000), block=32)
+    >>> measure_round_trip(interface, level=0.1)  # two blocks of 32 samples, and two samples of the path
     66
     """
     level, longest = as_positive(level, "level"), as_count(longest, "longest")
@@ -432,15 +439,16 @@ def run(
     Examples
     --------
     >>> import numpy as np
-    >>> from kfopc_filterpy import kf_pb
+    >>> from kfopc_filterpy import Plant, kf_pb
     >>> from kfopc_filterpy.realtime import SimulatedInterface, run
     >>> noise = np.random.default_rng(0).standard_normal(100_000)
     >>> primary = np.zeros(120)
     >>> primary[[80, 90]] = 1.0, 0.4
-    >>> plant = SimulatedInterface(noise, [0.0, 0.9, 0.3], primary_path=primary, block=32)
-    >>> def make(plant):
-    ...     return kf_pb(32, plant.taps, rated_power=2.0, secondary_path_uncertainty=plant.uncertainty)
-    >>> report = run(make, plant, amplitude_limit=10.0, seconds=2.0, identify_s=2.0)
+    >>> interface = SimulatedInterface(noise, Plant([0.0, 0.9, 0.3], primary, fs=16000), block=32)
+    >>> def make(identified):
+    ...     uncertainty = identified.uncertainty
+    ...     return kf_pb(32, identified.plant, rated_power=2.0, secondary_path_uncertainty=uncertainty)
+    >>> report = run(make, interface, amplitude_limit=10.0, seconds=2.0, identify_s=2.0)
     >>> report.stopped_by, report.round_trip_samples, bool(report.reduction_db[0] > 10.0)
     ('end', 65, True)
     """
@@ -704,7 +712,7 @@ def _require_fit(supervisor: Supervisor, interface: Interface) -> None:
 
 def _possible_db(silence: _Heard, controller: Any, fs: float) -> float:
     """Return the noise reduction of the best filter; raise `NotCausalError` if only a faster plant would allow any."""
-    path, n_taps = getattr(controller, "secondary_path", None), getattr(controller, "n_taps", None)
+    path, n_taps = getattr(controller, "secondary", None), getattr(controller, "n_taps", None)
     x, d = silence.x, silence.e
     if getattr(controller, "internal_model", False):
         x = np.concatenate((x, predictor_reference(d)))
@@ -732,11 +740,14 @@ def _best_db(x: np.ndarray, d: np.ndarray, path: Any, n_taps: int, fs: float) ->
     """Return the noise reduction of the best filter of some taps, whatever its power."""
     import warnings
 
-    if np.ndim(path) == 1:
-        x, d = x[0], d[0]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", np.exceptions.RankWarning)  # a lower bound does here
         solution = power_constrained_wiener(
-            x, d, path, n_taps, LOUDEST * float(np.mean(x**2)), fs=fs, segment_s=d.shape[-1] / fs
+            x,
+            Plant(path, fs=fs),
+            n_taps=n_taps,
+            rated_power=LOUDEST * float(np.mean(x**2)),
+            disturbance=d,
+            segment_s=d.shape[-1] / fs,
         )
     return float(np.max(solution.unconstrained.noise_reduction_db))

@@ -18,7 +18,6 @@ from ..controllers.channel_samples import through
 from ..controllers.core_controller import CoreController
 from ..controllers.processing import RefusedUpdate, process_steps
 from ..paths.uncertainty import GUARD_TAPS
-from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
 from .adaptation import Adaptation
 from .faults import GOOD, KINDS, NOT_FINITE, REPEATED, STUCK, Inspector, is_repeated
@@ -53,7 +52,7 @@ class Supervisor(Checkpointed):
     controller : Controller
         Any controller that can be copied. A fresh copy of its present state replaces it after a divergence. A feedback
         controller (`controllers.with_internal_model`) has no references: its blocks are ``process(None, errors)``.
-    fs : float, default 16000
+    fs : float
         Sample rate in Hz.
     amplitude_limit : float or array_like, shape (J,)
         Largest magnitude of the control signal, of all loudspeakers or of each. The controller does not know about this
@@ -130,11 +129,11 @@ class Supervisor(Checkpointed):
     Examples
     --------
     >>> import numpy as np
-    >>> from kfopc_filterpy import FxLMS
+    >>> from kfopc_filterpy import fx_lms
     >>> from kfopc_filterpy.realtime import Supervisor
     >>> path = np.zeros(33)
     >>> path[32] = 1.0  # the delay of a block is part of the secondary path
-    >>> supervisor = Supervisor(FxLMS(8, path, step_size=0.01), amplitude_limit=0.5)
+    >>> supervisor = Supervisor(fx_lms(8, path, step_size=0.01), fs=8000, amplitude_limit=0.5)
     >>> reference = np.sin(np.arange(32.0))
     >>> error = reference.copy()
     >>> error[[3, 4]] = np.nan, np.inf
@@ -147,7 +146,7 @@ class Supervisor(Checkpointed):
         self,
         controller: Controller,
         *,
-        fs: float = DEFAULT_FS,
+        fs: float,
         amplitude_limit: PerLoudspeaker,
         full_scale: float | None = None,
         stuck_s: float = 0.01,
@@ -413,7 +412,7 @@ class Supervisor(Checkpointed):
         The sound of this block does not count yet: an estimated path begins with at least a block of zeros. Where an
         error is missing, the disturbance is zero.
         """
-        path = np.reshape(self.controller.secondary_path, (self.n_microphones, self.n_loudspeakers, -1))
+        path = np.reshape(self.controller.secondary, (self.n_microphones, self.n_loudspeakers, -1))
         wanted, withheld = (
             through(path, np.pad(y, ((0, 0), (0, e.shape[1]))))
             for y in (self._wanted_y, self._wanted_y - self._played_y)
@@ -663,12 +662,12 @@ def _modelled_samples(controller: Any) -> int:
             "controller must not have virtual microphones and an internal model: its paths are not those to the error "
             "microphones; let it run by its own process, without a supervisor"
         )
-    return int(np.shape(controller.secondary_path)[-1]) - 1
+    return int(np.shape(controller.secondary)[-1]) - 1
 
 
 def _remembered(controller: Any) -> int:
     """Return the number of samples for which a reference has an effect on what a controller learns."""
-    path, n_taps = getattr(controller, "secondary_path", None), getattr(controller, "n_taps", None)
+    path, n_taps = getattr(controller, "secondary", None), getattr(controller, "n_taps", None)
     if path is None or n_taps is None:
         return 0
     primary = getattr(controller, "primary_path", None)

@@ -22,8 +22,8 @@ from kfopc_filterpy._validate import (
     per_channel,
 )
 from kfopc_filterpy.bounds import coherence_bound, predictor_reference
-from kfopc_filterpy.controllers.posterior import DEFAULT_UNCERTAINTY
-from kfopc_filterpy.loop.inputs import channel_disturbances
+from kfopc_filterpy.bounds.wiener import mean_square, reduction_db
+from kfopc_filterpy.controllers.kf_pb import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.metrics import (
     a_weighted_level_db,
     convergence_time_s,
@@ -41,15 +41,25 @@ from kfopc_filterpy.paths import (
 from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.file_checks import require_different, require_heard, require_sound
 from kfopc_filterpy.paths.models import sampling_rate, tells_rate
-from kfopc_filterpy.paths.path_matrix import primary_paths, secondary_paths
 from kfopc_filterpy.paths.uncertainty import Uncertainty, as_uncertainty
+from kfopc_filterpy.plant import Plant, as_plant
 from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_remarks
 
-from .._types import PathModels, ProgressBar
+from .._types import ProgressBar
 from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on
 from .candidates import CANDIDATES, CHOSEN, DIRECT, ONE_CHANNEL, Settings
 from .fixed_filters import FixedFilters, longest_filter
-from .limits import Limits, Ratings, excursion_mm, limits_of, ratings_of_each, scale_of, watt_per_power, with_excursion
+from .limits import (
+    ChannelLimits,
+    Limits,
+    Ratings,
+    excursion_mm,
+    limits_of,
+    ratings_of_each,
+    scale_of,
+    watt_per_power,
+    with_excursion,
+)
 from .runs import NSE_WINDOW_S, Plan, announce, one_blas_thread
 
 ALL = "all"
@@ -61,17 +71,16 @@ LEAST_RUN_S = 2.0  # its second half then has ten of an amplifier's windows of 0
 LEAST_TOLERANCE = 0.01  # of the least rated power
 SAME_DB, KEPT = 0.1, 1.02  # runs that differ by less are as good, and a rating that is exceeded by less is kept
 LOUDER_DB, HEARD_DB = 1.0, 40.0  # of a third octave: by how much, and how far below the loudest one at most
+DIFFERING_DB = -6.0  # left of a recorded disturbance by a primary path, from which a note says so
 NEARLY_FREE = 1e6  # times the power of the bound: an amplifier without limits
 
 
 @one_blas_thread()
 def assess(
     noise: ArrayLike,
-    primary: PathModels,
-    secondary: PathModels,
+    plant: Plant,
     *,
     rating: Ratings,
-    fs: float,
     disturbance: ArrayLike | None = None,
     want_db: float = 6.0,
     algorithm: str = "KF-PB",
@@ -95,21 +104,18 @@ def assess(
     ----------
     noise : array_like, shape (n_samples,) or (I, n_samples)
         Recording of the reference microphones, with silent loudspeakers; if there are none, of the error microphones (see
-        `feedback`). The rate of a `Recording` must be `fs`.
-    primary : array_like, shape (n_path,) or (K, I, n_path), or control.TransferFunction, optional
-        Impulse response from each reference to each error microphone. None with a `disturbance`, or without reference
-        microphones.
-    secondary : array_like, shape (n_path,) or (K, J, n_path), or control.TransferFunction
-        Impulse response from each control signal to each error microphone.
+        `feedback`). A `Recording` must have the plant's sample rate.
+    plant : Plant
+        Paths from each reference and from each control signal to each error microphone. The primary path may be missing
+        if there is a `disturbance`, or no reference microphone. The amplifiers are those of the `rating`.
     rating : float, AmplifierRating, LoudspeakerRating, or a sequence of them
         What the amplifier and the loudspeaker bear; a number is a rated power in squared units of the control signal. With
         several loudspeakers one rating for all, or a sequence with an entry for each: a rating, or a sequence of ratings
         that hold together.
-    fs : float
-        Sample rate in Hz of all of them.
     disturbance : array_like, shape (n_samples,) or (K, n_samples), optional
         Recording of the error microphones, made together with `noise`. It contains what the reference does not explain,
-        so that the coherence can be checked. By default it is computed by the primary path.
+        so that the coherence can be checked, and is compared with what the primary path gives, if there is one. By default
+        it is computed by the primary path.
     want_db : float, default 6
         Noise reduction wanted in dB.
     algorithm : str, default "KF-PB"
@@ -125,7 +131,7 @@ def assess(
     memory_s : float, optional
         Memory of KF-OPC in s, by which the settings are suggested; by default 0.25 s, and 1 s with several channels.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        How far the true secondary path may differ from `secondary`, for KF-PB, which learns the path as it controls:
+        How far the true secondary path may differ from the plant's, for KF-PB, which learns the path as it controls:
         a relative error, by default 0.3, or what `paths.path_uncertainty` takes. None: it is exact.
     pascal_per_unit : float or array_like, shape (K,), optional
         Sound pressure at the error microphone in Pa for a value of 1, of all microphones or of each. With it, sound levels
@@ -134,7 +140,7 @@ def assess(
         Time in s at which the control is switched on; by default 0.5 s, or a tenth of a shorter record.
     feedback : bool, default False
         Whether the controllers also predict the disturbance from its past (hybrid control, see `with_internal_model`). If
-        neither `primary` nor `disturbance` is given, there is no reference microphone, as in headphones, and `noise` is
+        there is neither a primary path nor a `disturbance`, there is no reference microphone, as in headphones, and `noise` is
         the disturbance.
     bar : tqdm bar, optional
         Bar that advances with the samples that are run, those on which settings are tried included; its total is set, and it
@@ -169,7 +175,7 @@ def assess(
     signal keeps it.
 
     With `feedback`, the disturbance one sample late is a reference, for the ceilings too: they are those of predictors, and
-    there is no coherence. `paths.internal_model_margin` judges the settled loop with `secondary` and with any measured paths
+    there is no coherence. `paths.internal_model_margin` judges the settled loop with the plant's path and with any measured ones
     in `secondary_path_uncertainty`; the least margin counts.
 
     With several loudspeakers the required rated powers are in the proportions of the ratings. The coherence is the multiple
@@ -179,18 +185,19 @@ def assess(
     Examples
     --------
     >>> import numpy as np
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.verdict import assess
     >>> from kfopc_filterpy.power import AmplifierRating
     >>> from kfopc_filterpy.signals import band_limited_noise
     >>> noise = band_limited_noise((100, 1000), 4.0, fs=8000, rng=1)
-    >>> primary, secondary = np.eye(64)[40], np.eye(16)[8]
-    >>> verdict = assess(noise, primary, secondary, rating=AmplifierRating(ohm=8, sine_watt=0.02), fs=8000, n_taps=64)
+    >>> plant = Plant(np.eye(16)[8], np.eye(64)[40], fs=8000)
+    >>> verdict = assess(noise, plant, rating=AmplifierRating(ohm=8, sine_watt=0.02), n_taps=64)
     >>> print(verdict.enough, verdict.limited_by)
     False amplifier
     """
-    fs = as_positive(fs, "fs", unit="Hz")
-    x, d, s = recorded_signals(noise, primary, secondary, disturbance, fs, feedback)
-    p = None if primary is None else primary_paths(primary, fs=fs, name="primary")[0]
+    as_plant(plant).require_constant("assess")
+    x, d, s = recorded_signals(noise, plant, disturbance, feedback)
+    fs, p = plant.fs, plant.primary
     several = s.ndim == 3
     K, J, n_references = (*s.shape[:2], len(x)) if several else (1, 1, 1)
     want_db = as_nonnegative(want_db, "want_db", unit="dB")
@@ -217,9 +224,8 @@ def assess(
         warnings.simplefilter("always", np.exceptions.RankWarning)
         settings = suggest_settings(
             x[..., start:],
-            d[..., start:],
-            s,
-            fs=fs,
+            Plant(s, fs=fs),
+            disturbance=d[..., start:],
             memory_s=memory_s,
             n_taps=None if n_taps is None else as_count(n_taps, "n_taps"),
             max_taps=longest_filter(J * n_references),
@@ -280,8 +286,8 @@ def assess(
         notes.append(f"Powers are mean squares of the control signal, not watts: {unknown}.")
     notes += recording_remarks(noise, fs, "noise")
     if disturbance is not None:
-        notes += clipping_remarks(disturbance, "disturbance")
-    elif primary is not None:
+        notes += clipping_remarks(disturbance, "disturbance") + _on_differing_path(noise, plant, disturbance)
+    elif p is not None:
         notes.append(
             "The disturbance was computed from the reference, so the coherence is not checked: record both microphones "
             "together and give the disturbance."
@@ -302,7 +308,7 @@ def assess(
         unlimited_power=bounds.free.control_power,
         required_rated_power=required,
         least_rated_power=least * limits.rated_power,
-        causality_margin_s=None if p is None else causality_margin(p if several else p[0, 0], s, fs=fs).margin_s,
+        causality_margin_s=None if p is None else causality_margin(plant).margin_s,
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
         band=_band(bounds.d, s, fs),
         levels=None if pascals is None else _levels(run, pascals),
@@ -325,39 +331,35 @@ def assess(
 
 
 def recorded_signals(
-    noise: ArrayLike,
-    primary: PathModels,
-    secondary: PathModels,
-    disturbance: ArrayLike | None,
-    fs: float,
-    feedback: bool = False,
+    noise: ArrayLike, plant: Plant, disturbance: ArrayLike | None, feedback: bool = False
 ) -> tuple[np.ndarray, ...]:
     """Return references, disturbances and secondary paths, checked, the recordings without their offsets.
 
-    With `feedback`, the disturbances one sample late are the last references, or the only ones if neither `primary` nor
-    `disturbance` is given: `noise` is then the disturbance. With one channel of each kind, there are no channel axes.
+    With `feedback`, the disturbances one sample late are the last references, or the only ones if there is neither a
+    primary path nor a `disturbance`: `noise` is then the disturbance. With one channel of each kind, there are no channel
+    axes.
     """
-    x = _recording(noise, "noise", fs)
-    s, _ = secondary_paths(secondary, fs=fs, name="secondary")
+    x, s = _recording(noise, "noise", plant.fs), plant.secondary
     K, J, _ = s.shape
     require_sound("secondary", s)
     if disturbance is not None:
-        d = _recording(disturbance, "disturbance", fs, length=x.shape[1])
+        d = _recording(disturbance, "disturbance", plant.fs, length=x.shape[1])
         _require_each_microphone(d, "disturbance", K)
         require_different("disturbance", d, "noise", x)
-    elif primary is None and feedback:
+    elif plant.primary is None and feedback:
         d, x = x, x[:0]
         _require_each_microphone(d, "noise", K)
-    elif primary is None:
-        raise ValueError("primary must be given unless there is a disturbance: what arrives at the error microphone?")
+    elif plant.primary is None:
+        raise ValueError(
+            "plant must have a primary path unless there is a disturbance: what arrives at the error microphone?"
+        )
     else:
-        p, _ = primary_paths(primary, fs=fs, name="primary")
-        if p.shape[:2] != (K, len(x)):
+        if plant.n_references != len(x):
             raise ValueError(
-                f"primary must be (K microphones, I references, taps) = ({K}, {len(x)}, taps), as secondary has {K} "
-                f"microphone(s) and noise {len(x)} channel(s), got {p.shape}; leave out the channels that do not fit"
+                f"noise must have the {plant.n_references} channel(s) of the plant's primary path, got {len(x)}; leave out "
+                "the channels that do not fit"
             )
-        d = channel_disturbances(x, p, None, fs, K)
+        _, d = plant.signals(x, None)
     if not np.any(d):
         raise ValueError("disturbance must not be silent: every value is 0")
     if feedback:
@@ -427,7 +429,7 @@ def _settled_loop(run: SimulationResult, s: np.ndarray, uncertainty: Any) -> Fee
         return None
     stated: Any = as_uncertainty(uncertainty)
     measured = [s, *np.reshape(stated, (-1, *s.shape[:-1], np.shape(stated)[-1]))] if np.ndim(stated) > 1 else [s]
-    loops = [internal_model_margin(run.weights[-1], path, s, fs=run.fs) for path in measured]
+    loops = [internal_model_margin(run.weights[-1], Plant(path, fs=run.fs), s) for path in measured]
     least = min(loops, key=lambda loop: loop.disk_margin)
     if not least.stable:
         raise ValueError(
@@ -436,6 +438,25 @@ def _settled_loop(run: SimulationResult, s: np.ndarray, uncertainty: Any) -> Fee
             "algorithm or fewer taps"
         )
     return least
+
+
+def _on_differing_path(noise: ArrayLike, plant: Plant, disturbance: ArrayLike) -> list[str]:
+    """Return a note if the primary path gives another disturbance than the one that was recorded."""
+    if plant.primary is None:
+        return []
+    x, d = (_recording(signal, name, plant.fs) for signal, name in ((noise, "noise"), (disturbance, "disturbance")))
+    if plant.n_references != len(x):
+        raise ValueError(
+            f"noise must have the {plant.n_references} channel(s) of the plant's primary path, got {len(x)}"
+        )
+    left = d - plant.signals(x, None)[1]
+    left_db = -reduction_db(mean_square(left), mean_square(d))
+    if left_db < DIFFERING_DB:
+        return []
+    return [
+        f"The recorded disturbance differs from the one that the primary path gives: {left_db:.1f} dB of its power is left. "
+        "The verdict is on the recorded one; the path counts for the causality margin only."
+    ]
 
 
 def _on_uncertain_path(loop: FeedbackMargin | None, s: np.ndarray, uncertainty: Any) -> list[str]:
@@ -564,18 +585,22 @@ def _levels(run: SimulationResult, pascal: Any) -> SoundLevels:
 
 def _figures(run: SimulationResult, limits: Limits, fs: float, settings: Settings) -> dict[str, Any]:
     """Return the figures of merit of a run and its settings; with several channels also of each microphone."""
-    power = output_power(run.control_signal)
+    several = isinstance(limits, ChannelLimits)  # also if only the references are several
+    signals = (run.control_signal, run.error, run.disturbance)
+    y, e, d = (np.atleast_2d(signal) if several else signal for signal in signals)
+    power = output_power(y)
     figures = {
-        "noise_reduction_db": noise_reduction_db(run.error, run.disturbance),
+        "noise_reduction_db": noise_reduction_db(e, d),
         "output_power": power,
         "of_rated_power": power / limits.rated_power,
-        "worst_window": overshoot(run.control_signal, limits.rated_power, fs, window_s=limits.window_s),
-        "peak_control_signal": peak_control_signal(run.control_signal, steady=1.0),
-        "convergence_time_s": convergence_time_s(run.error, run.disturbance, fs, window_s=NSE_WINDOW_S),
+        "worst_window": overshoot(y, limits.rated_power, fs, window_s=limits.window_s),
+        "peak_control_signal": peak_control_signal(y, steady=1.0),
+        "convergence_time_s": convergence_time_s(e, d, fs, window_s=NSE_WINDOW_S),
         "diverged_at_s": run.diverged_at_s,
         "settings": {key: float(settings[key]) for key in settings if key in CHOSEN},
     }
-    if run.error.ndim == 1:
+    if not several:
         return figures
-    pairs = zip(run.error, run.disturbance, strict=True)
-    return figures | {"noise_reduction_by_microphone_db": [noise_reduction_db(e, d) for e, d in pairs]}
+    return figures | {
+        "noise_reduction_by_microphone_db": [noise_reduction_db(*pair) for pair in zip(e, d, strict=True)]
+    }

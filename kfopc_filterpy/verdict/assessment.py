@@ -305,7 +305,7 @@ class Assessment:
             "ceilings": vars(self.ceilings),
             "band": vars(self.band),
             "levels": self.levels and vars(self.levels),
-            "settings": {"n_taps": self.settings.n_taps, **self.settings.settings},
+            "settings": {"n_taps": self.settings.n_taps, **self.settings.noises},
             "algorithms": self.figures,
             "version": __version__,
         }

@@ -60,7 +60,7 @@ class Known:
     @property
     def noises(self) -> Settings:
         """Suggested settings of a Kalman filter."""
-        return self.suggested.settings
+        return self.suggested.noises
 
     @property
     def energy(self) -> float:

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from kfopc_filterpy import Plant
 from kfopc_filterpy.bounds import budgeted_rated_power
-from kfopc_filterpy.bounds.channel_bound import ChannelStretch, full_channel_stretch
+from kfopc_filterpy.bounds.channel_bound import ChannelStretch, channel_record
 from kfopc_filterpy.bounds.power_constrained import weights_within
 from kfopc_filterpy.bounds.wiener import Stretch, full_stretch, loss_db, reduction_db, warn_of_loss
 
@@ -50,7 +51,7 @@ class FixedFilters:
         self.x, self.d, self.s, self.n_taps, self.fs = x[..., first:], d[..., first:], s, n_taps, fs
         self.several = s.ndim == 3
         if self.several:
-            self.stretch = full_channel_stretch(self.x, self.d, s, n_taps, fs)
+            self.stretch = channel_record(self.x, self.d, s, n_taps).full(s.shape[-1])
         else:
             self.stretch = full_stretch(self.x, self.d, s, n_taps)
         self.correlations: Any = self.stretch.correlations()
@@ -96,9 +97,14 @@ class FixedFilters:
         """
         if noise_reduction_db <= 0:
             return np.zeros(np.shape(rated_power))[()]
-        plant, proportions = (self.x, self.d, self.s, self.n_taps), rated_power if self.several else None
         found = budgeted_rated_power(
-            noise_reduction_db, *plant, fs=self.fs, proportions=proportions, beyond="inf"
+            noise_reduction_db,
+            self.x,
+            Plant(self.s, fs=self.fs),
+            n_taps=self.n_taps,
+            disturbance=self.d,
+            proportions=rated_power if self.several else None,
+            beyond="inf",
         ).rated_power
         return found if self.several else float(found)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from kfopc_filterpy import SimulationResult, nse_db, simulate
+from kfopc_filterpy import Plant, SimulationResult, nse_db, simulate
 from kfopc_filterpy.bounds import SuggestedSettings
 from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.controllers.table import CORE
@@ -113,11 +113,8 @@ class Plan:
         return simulate(
             controller,
             x,
+            Plant(self.s, amplifier=amplifiers(limits), fs=self.fs),
             disturbance=d,
-            secondary_path=self.s,
-            fs=self.fs,
-            amplifier=amplifiers(limits),
-            rated_power=limits.rated_power,
             switch_on_s=self.start / self.fs,
             **options,
         )
