@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kfopc_filterpy import KFOPC, FxLMS, OutputPowerConstraint, kf_opc
+from kfopc_filterpy import KFOPC, OutputPowerConstraint, Plant, fx_lms, kf_opc
 from kfopc_filterpy.commands import main
 from kfopc_filterpy.controllers import RefusedUpdate
 from kfopc_filterpy.realtime import Supervisor
@@ -31,9 +31,9 @@ PATHS = np.random.default_rng(3).standard_normal((2, 2, 4))
 LIMIT = 2.0
 KALMAN: dict[str, Any] = {"state_noise": 1e-7, "measurement_noise": 1e-2, "initial_variance": 1e-2}
 CONTROLLERS: dict[str, Callable[[], Any]] = {
-    "FxLMS": lambda: FxLMS(8, PATH, step_size=1e-3),
+    "FxLMS": lambda: fx_lms(8, PATH, step_size=1e-3),
     "KF-OPC": lambda: kf_opc(8, PATH, constraint=OutputPowerConstraint(0.5, fs=FS), **KALMAN),
-    "FxLMS of several channels": lambda: FxLMS(8, PATHS, step_size=1e-3),
+    "FxLMS of several channels": lambda: fx_lms(8, PATHS, step_size=1e-3),
 }
 SCALARS: list[Any] = [
     *(0.0, -0.0, 1.0, -3.5, 5e-324, 1e-160, 1e-30, 1e30, 1e80, 1e154, -1e155, 1e300, np.finfo(float).max),
@@ -187,6 +187,32 @@ def test_a_supervisor_is_finite_and_within_its_limit(name: str) -> None:
             else:
                 np.testing.assert_array_equal(supervisor.controller.weights, weights)
                 assert dict(supervisor.health.samples) == health, (given, lost, error)
+
+
+def test_a_plant_and_its_changes_are_refused_or_have_finite_paths_and_a_finite_disturbance() -> None:
+    for rng in rounds(200):
+        n = int(rng.integers(1, 4))
+        shapes = {"secondary": (n, 2, 4), "primary": (n, 1, 4), "feedback": (1, 2, 4)}
+        given = {name: anything(rng, shape) for name, shape in shapes.items() if rng.random() < 0.7}
+        numbers = {"fs": FS, "sensor_noise_std": 0.0, "n_path": None}
+        given |= {name: SCALARS[rng.integers(len(SCALARS))] if rng.random() < 0.1 else v for name, v in numbers.items()}
+        given |= {"amplifier": SCALARS[rng.integers(len(SCALARS))]} if rng.random() < 0.2 else {}
+        plant, error = refused(lambda: Plant(**{"secondary": np.ones((n, 2, 4))} | given))  # noqa: B023 - called at once
+        if error is not None:
+            continue
+        before = repr(plant)
+        changes = {name: anything(rng, shape) for name, shape in shapes.items() if rng.random() < 0.5}
+        changed, error = refused(lambda: plant.changed_at(1.0, **changes))  # noqa: B023 - called at once
+        for one in (plant, *([] if error else [changed.at(2.0)])):
+            for paths in (one.secondary, one.primary, one.feedback):
+                assert paths is None or (paths.ndim == 3 and np.isfinite(paths).all()), (given, changes)
+        assert repr(plant) == before
+        x = anything(rng, (1, 20))
+        if (
+            max(magnitude(x), magnitude(plant.primary), magnitude(x) * magnitude(plant.primary)) < 1e290
+        ):  # or sums overflow
+            d, error = refused(lambda: plant.disturbance(x))  # noqa: B023 - called at once
+            assert error is not None or np.isfinite(d).all(), (given, x)
 
 
 def test_a_filter_refuses_and_stays_or_is_finite() -> None:

@@ -16,7 +16,7 @@ from helpers.commands import FS, ROOT, SCENE
 from matplotlib.figure import Figure
 
 from comparisons.bench import Sound, StudyReport, write_report
-from kfopc_filterpy import FxLMS, _writing
+from kfopc_filterpy import _writing, fx_lms
 from kfopc_filterpy.commands import main
 from kfopc_filterpy.export import export_c
 from kfopc_filterpy.plot import save_figure
@@ -40,8 +40,8 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "S.NPY": lambda folder: convert(folder, "S.NPY"),
     "error.wav": lambda folder: write_wav(folder / "error.wav", np.ones(500), FS),
     "figure.svg": lambda folder: save_figure(Figure(), folder / "figure"),
-    "anc.c": lambda folder: export_c(FxLMS(8, [1.0], step_size=0.1), folder / "anc.c"),
-    "run.npz": lambda folder: FxLMS(500, [1.0], step_size=0.1).save(folder / "run.npz"),
+    "anc.c": lambda folder: export_c(fx_lms(8, [1.0], step_size=0.1), folder / "anc.c"),
+    "run.npz": lambda folder: fx_lms(500, [1.0], step_size=0.1).save(folder / "run.npz"),
     "report.html": lambda folder: write_report([report()], folder),
 }
 
@@ -113,7 +113,7 @@ def interrupt_at(line: int) -> Iterator[None]:
 
 def test_files_that_belong_together_are_all_old_or_all_new_at_whatever_line_their_writer_is_interrupted(tmp_path):
     """Each file states the number of taps: no mixture passes."""
-    controllers = [FxLMS(taps, [1.0], step_size=0.1) for taps in (8, 9)]
+    controllers = [fx_lms(taps, [1.0], step_size=0.1) for taps in (8, 9)]
     whole = []
     for controller in controllers:
         export_c(controller, tmp_path / "anc.c")

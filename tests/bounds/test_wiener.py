@@ -7,9 +7,10 @@ import pytest
 import scipy.signal
 from helpers.channels import delayed
 
+from kfopc_filterpy import Plant
 from kfopc_filterpy.bounds import coherence_bound, wiener_solution
 from kfopc_filterpy.bounds.power_constrained import power_constrained_solution, power_constrained_wiener
-from kfopc_filterpy.paths import duct_paths
+from kfopc_filterpy.paths import duct_plant
 from kfopc_filterpy.paths.least_squares import correlation_matrix
 from kfopc_filterpy.paths.models import bandpass_path, path_taps
 from kfopc_filterpy.signals import band_limited_noise
@@ -36,7 +37,9 @@ def test_weights_are_those_of_dense_least_squares(n_taps, ridge, penalty):
     matrix = np.vstack([rows, np.sqrt(penalty) * control_rows, scale * np.eye(n_taps)])
     right = np.concatenate([d[start:], np.zeros(len(control_rows) + n_taps)])
     expected = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    found = wiener_solution(x, d, s, n_taps, regularization=ridge, control_penalty=penalty)
+    found = wiener_solution(
+        x, Plant(s, fs=FS), n_taps=n_taps, disturbance=d, regularization=ridge, control_penalty=penalty
+    )
     # Normal equations of condition number below 1e4 lose 4 digits of 16.
     np.testing.assert_allclose(found.weights, expected, rtol=1e-9, atol=1e-10)
     y = scipy.signal.lfilter(expected, 1.0, x)
@@ -52,8 +55,8 @@ def test_tone_has_the_minimum_norm_solution():
     n = np.arange(8000)
     x = np.sin(2 * np.pi * 400 * n / FS)
     d = 0.7 * np.sin(2 * np.pi * 400 * n / FS + 1.0)
-    s = path_taps(bandpass_path(32))
-    found = wiener_solution(x, d, s, 64)
+    s = path_taps(bandpass_path(32, fs=FS))
+    found = wiener_solution(x, Plant(s, fs=FS), n_taps=64, disturbance=d)
     start = 64 + 32 - 2
     steady_s = np.exp(-2j * np.pi * 400 / FS * np.arange(32)) @ s
     # s*x without start-up, so that the oracle's matrix has rank two exactly as well.
@@ -75,23 +78,42 @@ def test_coherence_bound_is_the_incoherent_share():
     # 0.04 of the power is incoherent: 14.1 dB; 780 half-overlapping segments leave 0.1 dB.
     assert bound.overall_db == pytest.approx(10 * np.log10(1.04 / 0.04), abs=0.15)
     assert bound.frequencies_hz.shape == bound.noise_reduction_db.shape == (257,)
-    assert wiener_solution(x, d + noise, [1.0], 8).noise_reduction_db <= bound.overall_db + 0.15
+    best = wiener_solution(x, Plant([1.0], fs=FS), n_taps=8, disturbance=d + noise)
+    assert best.noise_reduction_db <= bound.overall_db + 0.15
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda x, d, s: wiener_solution(x[:9], d[:9], s, 4), "reference must have at least 10 samples"),
-        (lambda x, d, s: wiener_solution(0 * x, d, s, 4), "reference through secondary_path must not be silent"),
-        (lambda x, d, s: wiener_solution(x, 0 * d, s, 4), "disturbance must not be silent"),
-        (lambda x, d, s: wiener_solution(x, d, s, 4, regularization=-1), "regularization must not be negative"),
-        (lambda x, d, s: coherence_bound(x, d, FS, segment=1024), "reference must have at least 8192"),
-        (lambda x, d, s: coherence_bound(0 * x, d, FS, segment=64), "must not be silent"),
+        (
+            lambda x, d, plant: wiener_solution(x[:9], plant, n_taps=4, disturbance=d[:9]),
+            "reference must have at least 10 samples",
+        ),
+        (
+            lambda x, d, plant: wiener_solution(0 * x, plant, n_taps=4, disturbance=d),
+            "reference through the secondary path must not be silent",
+        ),
+        (
+            lambda x, d, plant: wiener_solution(x, plant, n_taps=4, disturbance=0 * d),
+            "disturbance must not be silent",
+        ),
+        (
+            lambda x, d, plant: wiener_solution(x, plant, n_taps=4, disturbance=d, regularization=-1),
+            "regularization must not be negative",
+        ),
+        (
+            lambda x, d, plant: wiener_solution(x, plant.changed_at(0.1, secondary=[1.0]), n_taps=4, disturbance=d),
+            "wiener_solution needs a plant that does not change",
+        ),
+        (lambda x, d, _: coherence_bound(x, d, FS, segment=1024), "reference must have at least 8192"),
+        (lambda x, d, _: coherence_bound(0 * x, d, FS, segment=64), "must not be silent"),
     ],
 )
 def test_wiener_refuses(call, message):
+    x, d, s = _scene()
+    plant = Plant(s, fs=FS)
     with pytest.raises(ValueError, match=message):
-        call(*_scene())
+        call(x, d, plant)
 
 
 # ---- Directions that float64 correlations do not resolve
@@ -100,12 +122,12 @@ def test_wiener_refuses(call, message):
 def narrow(n=12_000, seed=0):
     """Noise of 300 to 400 Hz through two paths, and what full least squares makes of it."""
     x = band_limited_noise((300.0, 400.0), n / FS, fs=FS, rng=seed)
-    duct = duct_paths(fs=FS)
-    d = np.convolve(x, path_taps(duct.primary))[: x.size]
-    return x[3000:], d[3000:], path_taps(duct.secondary)
+    plant = duct_plant(fs=FS)
+    return x[3000:], plant.disturbance(x)[3000:], plant
 
 
-def dense_reduction_db(x, d, s, n_taps):
+def dense_reduction_db(x, d, plant, n_taps):
+    s = plant.secondary[0, 0]
     start = n_taps + s.size - 2
     rows = delayed(np.convolve(x, s)[None, : x.size], n_taps)[:, start:].T
     weights = np.linalg.lstsq(rows, d[start:], rcond=None)[0]
@@ -114,10 +136,10 @@ def dense_reduction_db(x, d, s, n_taps):
 
 
 def test_a_narrow_band_reference_warns_that_larger_weights_do_better():
-    x, d, s = narrow()
-    reached, largest = dense_reduction_db(x, d, s, 64)
+    x, d, plant = narrow()
+    reached, largest = dense_reduction_db(x, d, plant, 64)
     with pytest.warns(np.exceptions.RankWarning, match="too narrow-band for this many taps") as caught:
-        found = wiener_solution(x, d, s, 64)
+        found = wiener_solution(x, plant, n_taps=64, disturbance=d)
     assert caught[0].filename == __file__
     assert reached > found.noise_reduction_db + 5
     assert largest > 1e4 * np.abs(found.weights).max()
@@ -127,25 +149,23 @@ def test_a_narrow_band_reference_warns_that_larger_weights_do_better():
 
 
 def test_the_bounds_within_a_power_warn_too():
-    x, d, s = narrow()
+    x, d, plant = narrow()
     with pytest.warns(np.exceptions.RankWarning, match="no bound"):
-        free = wiener_solution(x, d, s, 64).control_power
-    for bound, options in (
-        (power_constrained_solution, {}),
-        (power_constrained_wiener, {"fs": FS, "switch_on_s": 0.1}),
-    ):
+        free = wiener_solution(x, plant, n_taps=64, disturbance=d).control_power
+    for bound, options in ((power_constrained_solution, {}), (power_constrained_wiener, {"switch_on_s": 0.1})):
         with pytest.warns(np.exceptions.RankWarning, match="no bound"):
-            bound(x, d, s, 64, 2 * free, **options)
+            bound(x, plant, n_taps=64, rated_power=2 * free, disturbance=d, **options)
 
 
 def test_what_the_cut_does_not_change_does_not_warn():
     """Warnings are errors in these tests."""
-    x, d, s = narrow()
-    wiener_solution(x, d, s, 64, regularization=1e-6)  # nothing is cut
+    x, d, plant = narrow()
+    wiener_solution(x, plant, n_taps=64, disturbance=d, regularization=1e-6)  # nothing is cut
     noise = np.sqrt(np.mean(d**2)) * np.random.default_rng(1).standard_normal(d.size)
-    wiener_solution(x, d + noise, s, 64)  # the reference explains half the disturbance; the cut changes little
-    n = np.arange(8000)
-    wiener_solution(np.sin(0.2 * n), np.sin(0.2 * n + 1), [0.5, 0.2], 32)  # two directions are all there are
+    # The reference explains half the disturbance; the cut changes little.
+    wiener_solution(x, plant, n_taps=64, disturbance=d + noise)
+    n = np.arange(8000)  # a tone: two directions are all there are
+    wiener_solution(np.sin(0.2 * n), Plant([0.5, 0.2], fs=FS), n_taps=32, disturbance=np.sin(0.2 * n + 1))
 
 
 def test_the_tolerance_keeps_directions_of_a_billionth_of_the_energy():
@@ -155,4 +175,4 @@ def test_the_tolerance_keeps_directions_of_a_billionth_of_the_energy():
     d = np.convolve(x, [0.0, 0.5, -0.8, 0.3])[: x.size]
     shares = np.linalg.eigvalsh(correlation_matrix(x, 32))
     assert 1e-10 < shares[0] / shares[-1] < 1e-8
-    assert wiener_solution(x[8:], d[8:], [1.0], 32).noise_reduction_db > 150
+    assert wiener_solution(x[8:], Plant([1.0], fs=FS), n_taps=32, disturbance=d[8:]).noise_reduction_db > 150

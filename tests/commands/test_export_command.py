@@ -10,11 +10,12 @@ import pytest
 from helpers.commands import FS
 
 from kfopc_filterpy import (
-    FxLMS,
     HardClipAmplifier,
     OutputLimiter,
     OutputPowerConstraint,
+    Plant,
     SoftSaturationAmplifier,
+    fx_lms,
     kf_opc,
     kf_pb,
     simulate,
@@ -26,11 +27,11 @@ from kfopc_filterpy.paths import PathTolerance, read_path
 
 STEP, NOISES = {"step_size": 1e-3}, {"state_noise": 1e-7, "measurement_noise": 1e-2}
 SETTINGS = {
-    "KF-OPC": NOISES | {"rated_power": 0.5},
-    "KF-PB": {"rated_power": 0.5},
+    "KF-OPC": NOISES | {"rated_power": 0.5, "fs": 16000.0},
+    "KF-PB": {"rated_power": 0.5, "fs": 16000.0},
     "FxRLS": {},
-    "MOV-FxLMS": STEP | {"rated_power": 0.5, "penalty_factor": 0.2},
-    "MOV-MFxLMS": STEP | {"rated_power": 0.5},
+    "MOV-FxLMS": STEP | {"rated_power": 0.5, "fs": 16000.0, "penalty_factor": 0.2},
+    "MOV-MFxLMS": STEP | {"rated_power": 0.5, "fs": 16000.0},
     "clipping FxLMS": STEP | {"amplitude_limit": 0.8},
 }
 
@@ -51,7 +52,7 @@ def same_as_of_python(controller, made, folder, dtype="float64"):
 @pytest.mark.parametrize("name", SETTINGS)
 def test_an_algorithm_is_described_by_its_name_and_settings(name, command, folder, tmp_path):
     path = [0.0, 0.8, 0.3]
-    (folder / "c.toml").write_text(described(algorithm=name, n_taps=8, secondary_path=path, **SETTINGS[name]))
+    (folder / "c.toml").write_text(described(algorithm=name, n_taps=8, secondary=path, **SETTINGS[name]))
     code, out, err = command("export", "c.toml", "-o", tmp_path / "out")
     assert (code, err) == (0, "")
     assert out.startswith("<CExport anc.c: ")
@@ -85,7 +86,7 @@ sharpness = 3.0
 phase_deg = 10.0
 """
     own = {"algorithm": "KF-OPC", "n_taps": 8, "rated_power": [0.5, 0.4], **NOISES}
-    (folder / "c.toml").write_text(described(secondary_path=["S1.wav", "S2.wav"], **own) + parts)
+    (folder / "c.toml").write_text(described(secondary=["S1.wav", "S2.wav"], **own) + parts)
     code, _, err = command("export", "c.toml", "-o", tmp_path / "out", "--dtype", "float32")
     assert (code, err) == (0, "")
     assert same_as_of_python(controller, tmp_path / "out", tmp_path, "float32")
@@ -95,7 +96,7 @@ phase_deg = 10.0
     ("file", "fs", "options"), [("S.wav", None, ()), ("S16.wav", FS, ()), ("S16.wav", 3 * FS, ("--fs", FS))]
 )
 def test_the_rate_is_that_of_the_option_the_settings_or_the_file(file, fs, options, command, folder, tmp_path):
-    settings = {"algorithm": "KF-PB", "n_taps": 8, "rated_power": 0.5, "secondary_path": file}
+    settings = {"algorithm": "KF-PB", "n_taps": 8, "rated_power": 0.5, "secondary": file}
     (folder / "c.toml").write_text(described(**settings | ({} if fs is None else {"fs": fs})))
     code, _, err = command("export", "c.toml", "-o", tmp_path / "out", *options)
     assert (code, err) == (0, "")
@@ -104,10 +105,8 @@ def test_the_rate_is_that_of_the_option_the_settings_or_the_file(file, fs, optio
 
 
 def test_a_controller_that_python_saved_goes_on(command, folder, tmp_path):
-    controller = FxLMS(8, [0.0, 1.0], step_size=0.01)
-    simulate(
-        controller, np.random.default_rng(0).standard_normal(500), primary_path=[0, 0, 1.0], secondary_path=[0, 1.0]
-    )
+    controller = fx_lms(8, [0.0, 1.0], step_size=0.01)
+    simulate(controller, np.random.default_rng(0).standard_normal(500), Plant([0, 1.0], [0, 0, 1.0], fs=16000))
     controller.save(folder / "trained.npz")
     code, _, err = command("export", "trained.npz", "-o", tmp_path / "out", "--name", "anc")
     assert (code, err) == (0, "")
@@ -117,31 +116,31 @@ def test_a_controller_that_python_saved_goes_on(command, folder, tmp_path):
 @pytest.mark.slow  # zig compiles for two systems
 def test_an_fmu_is_that_of_python(command, folder, tmp_path):
     pytest.importorskip("ziglang", reason="zig compiles the libraries")
-    (folder / "c.toml").write_text(described(algorithm="FxLMS", n_taps=8, secondary_path="S.wav", step_size=0.01))
+    (folder / "c.toml").write_text(described(algorithm="FxLMS", n_taps=8, secondary="S.wav", step_size=0.01))
     code, out, err = command("export", "c.toml", "-o", tmp_path / "out", "--fmu", "--name", "left")
     assert (code, err) == (0, "")
     assert out.rstrip() == str(tmp_path / "out" / "left.fmu")
-    controller = FxLMS(8, read_path(folder / "S.wav").samples, step_size=0.01)
+    controller = fx_lms(8, read_path(folder / "S.wav").samples, step_size=0.01)
     expected = export_fmu(controller, tmp_path / "left.fmu", fs=FS)
     assert (tmp_path / "out" / "left.fmu").read_bytes() == expected.read_bytes()
     assert "binaries/x86_64-windows/left.dll" in zipfile.ZipFile(expected).namelist()
 
 
-GOOD = {"algorithm": "FxLMS", "n_taps": 8, "secondary_path": [0.0, 1.0], "step_size": 0.01}
+GOOD = {"algorithm": "FxLMS", "n_taps": 8, "secondary": [0.0, 1.0], "step_size": 0.01}
 RATED_TWICE = GOOD | {"algorithm": "KF-OPC", "rated_power": 1.0, "fs": 8000} | NOISES
 RATED_TWICE.pop("step_size")
 WRONG = {
     "unknown algorithm": (GOOD | {"algorithm": "FXLMS"}, "", "algorithm in c.toml must be one of 'KF-ANC'.*'FXLMS'"),
-    "unknown setting": (GOOD | {"step": 1.0}, "", "c.toml: there is no setting step, but n_taps, secondary_path"),
+    "unknown setting": (GOOD | {"step": 1.0}, "", "c.toml: there is no setting step, but n_taps, secondary"),
     "unknown setting of a part": (
         GOOD,
         "[limiter]\nwatt = 1",
         r"\[limiter\]: there is no setting watt, but rated_power",
     ),
     "bad setting": (GOOD | {"step_size": -1.0}, "", "c.toml: step_size must be greater than 0, got -1"),
-    "missing setting": ({"algorithm": "FxLMS", "n_taps": 8}, "", "c.toml: .*missing.*'secondary_path'"),
+    "missing setting": ({"algorithm": "FxLMS", "n_taps": 8}, "", "c.toml: .*missing.*'secondary'"),
     "no TOML": ({}, "algorithm: FxLMS", "c.toml is not TOML: "),
-    "missing file": (GOOD | {"secondary_path": "none.wav"}, "", "none.wav"),
+    "missing file": (GOOD | {"secondary": "none.wav"}, "", "none.wav"),
     "two budgets": (RATED_TWICE, "[constraint]\nrated_power = 1.0", "give either rated_power= or constraint="),
 }
 
@@ -157,7 +156,7 @@ def test_what_is_wrong_in_a_settings_file_is_said_in_one_line(case, command, fol
 
 
 def test_other_wrong_input(command, folder, tmp_path):
-    FeedbackNeutralizer(FxLMS(8, [0.0, 1.0], step_size=0.01), [0.0, 0.1]).save(folder / "wrapped.npz")
+    FeedbackNeutralizer(fx_lms(8, [0.0, 1.0], step_size=0.01), [0.0, 0.1]).save(folder / "wrapped.npz")
     (folder / "c.toml").write_text(described(**GOOD))
     for arguments, message in {
         ("wrapped.npz",): r"FxLMS .* \(FeedbackNeutralizer\) is not in the core and cannot be exported",

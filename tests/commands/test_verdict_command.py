@@ -17,10 +17,10 @@ import scipy.io
 import soundfile
 from helpers.commands import FS, ROOT, SCENE, process
 
-from kfopc_filterpy import verdict
+from kfopc_filterpy import Plant, verdict
 from kfopc_filterpy.bounds import predictor_reference, wiener_solution
 from kfopc_filterpy.commands import main
-from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
+from kfopc_filterpy.controllers.kf_pb import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.signals import band_limited_noise, read_recording, write_wav
 from kfopc_filterpy.verdict import assess
@@ -235,7 +235,7 @@ def test_several_channels_are_read_in_the_order_that_the_help_states(command, se
     rating = ["--rated-power", 4, "--rated-power", 0.05]
     code, out, err = command("verdict", "noise.wav", *files, *options, *rating, "--taps", 32, "--json", "--quiet")
     x, p, s = several
-    verdict = assess(x.astype(np.float32), p, s.astype(np.float32), rating=[4.0, 0.05], fs=FS, n_taps=32)
+    verdict = assess(x.astype(np.float32), Plant(s.astype(np.float32), p, fs=FS), rating=[4.0, 0.05], n_taps=32)
     data = json.loads(out)
     assert code == (0 if verdict.enough else 1), err
     assert data["channels"] == {"references": 1, "loudspeakers": 2, "microphones": 2}
@@ -259,7 +259,7 @@ def test_without_a_reference_microphone_the_noise_is_that_of_the_ear(command, fo
     assert data["ceilings"]["coherence_db"] is None
     d, s = (read_recording(folder / f"{name}.wav").one_channel() for name in ("d", "S"))
     half = d[d.size // 2 :] - d.mean()
-    free = wiener_solution(predictor_reference(half), half, s, 32)
+    free = wiener_solution(predictor_reference(half), Plant(s, fs=16000), n_taps=32, disturbance=half)
     assert data["ceilings"]["filter_db"] == pytest.approx(
         free.noise_reduction_db, abs=0.2
     )  # whose stretches differ a bit

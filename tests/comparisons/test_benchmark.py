@@ -7,12 +7,12 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.pages import ROOT
+from helpers.results import single_result
 
 from comparisons.bench import Algorithm, Runs, algorithms, make_controller
 from comparisons.bench.registry import registered
@@ -20,7 +20,7 @@ from comparisons.benchmark import study, tasks
 from comparisons.benchmark.blocks import CommandController, EntryFailed
 from comparisons.benchmark.entries import peers, rivals
 from comparisons.benchmark.tasks import FOLDER, LeftOut, Task, read_task
-from kfopc_filterpy import FxNLMS
+from kfopc_filterpy import fx_nlms
 
 PAGE = (ROOT / "docs" / "benchmark.md").read_text(encoding="utf-8")
 PRINTED = (ROOT / "docs" / "benchmark.txt").read_text(encoding="utf-8")
@@ -113,7 +113,7 @@ def test_the_figures_of_a_made_up_run(short: Task) -> None:
     e = np.where(np.arange(d.size) < 0.5 * fs, 1.0, 0.1)
     e[2 * 8000 : 3 * 8000] = 3.0
     y = np.full(d.size, np.sqrt(0.5))
-    result: Any = SimpleNamespace(error=e, disturbance=d, control_signal=y, diverged_at_s=None)
+    result = single_result(d.size, fs, error=e, disturbance=d, control_signal=y)
     one = study.score(task, "made up", result, bound_db=23.0)
     assert one.noise_reduction_db == pytest.approx(20.0)
     assert one.below_bound_db == pytest.approx(3.0)
@@ -148,7 +148,7 @@ def test_filters_that_are_one_algorithm_agree(short: Task, theirs: str, same: st
 
 def test_every_entry_has_a_score_or_a_reason(short: Task, tmp_path: Path) -> None:
     class Broken:
-        def __init__(self, n_taps: int, secondary_path: Any, **_: Any) -> None:
+        def __init__(self, n_taps: int, secondary: Any, **_: Any) -> None:
             raise RuntimeError("out of order")
 
     broken = Algorithm(Broken, lambda task, mu, _: {}, "mu", "mu", (0.1,))
@@ -179,12 +179,12 @@ def command(tmp_path: Path, text: str) -> str:
 
 def test_the_command_of_the_page_gives_the_run_of_the_object(short: Task, tmp_path: Path) -> None:
     """Its blocks hold what a run sample by sample holds, because the secondary path begins with a block of zeros."""
-    (text,) = [text for text in PYTHON if "FxNLMS" in text]
+    (text,) = [text for text in PYTHON if "fx_nlms" in text]
     assert len(text.strip().splitlines()) <= 12
     with CommandController(short, command(tmp_path, text)) as entry:
         blocks = short.run(entry, 1)
     s, delay = short.known_secondary, short.block
-    own = short.run(FxNLMS(short.n_taps, s, step_size=0.1, regularization=1.0), 1)
+    own = short.run(fx_nlms(short.n_taps, s, step_size=0.1, regularization=1.0), 1)
     np.testing.assert_allclose(blocks.error, own.error, atol=1e-9)
     np.testing.assert_allclose(blocks.control_signal[delay:], own.control_signal[:-delay], atol=1e-9)
 

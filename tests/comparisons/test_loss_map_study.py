@@ -10,18 +10,18 @@ from helpers.studies import run_study, smaller
 
 from comparisons.bench import StudyReport
 from comparisons.studies import kf_pb_cases, loss_map
-from comparisons.studies.cases import SENSOR_NOISE_DB
+from comparisons.studies.cases import FS, SENSOR_NOISE_DB
 from comparisons.studies.kf_pb_cases import Rated, make_rated, noises
+from kfopc_filterpy import Plant
 
 TAPS, LONG = 12, 40
-PRIMARY, SECONDARY = np.array([0.0] * 6 + [1.0, 0.5, 0.25]), np.array([0.0, 0.0, 1.0, -0.6, 0.2])
+PLANT = Plant([0.0, 0.0, 1.0, -0.6, 0.2], [0.0] * 6 + [1.0, 0.5, 0.25], fs=FS)
 
 
 @pytest.fixture(scope="module")
 def report() -> Iterator[StudyReport]:
     """Few taps, one pair of short paths, no measured data."""
-    paths = {"short": (PRIMARY, SECONDARY)}
-    with smaller(kf_pb_cases, N_TAPS=TAPS, all_paths=lambda: paths), smaller(loss_map, LONG=LONG):
+    with smaller(kf_pb_cases, N_TAPS=TAPS, all_plants=lambda: {"short": PLANT}), smaller(loss_map, LONG=LONG):
         yield run_study(loss_map)
 
 
@@ -37,11 +37,11 @@ def test_the_losses_lead_from_the_sensor_noise_to_what_is_left(report: StudyRepo
 
 def test_a_filter_with_any_power_is_that_of_batch_least_squares() -> None:
     """To 0.1 dB: the ridge, which least squares lacks, is 40 dB below the filtered reference."""
-    case: Rated = make_rated((PRIMARY, SECONDARY), noises()["band noise"][1](), 0.25)
-    filtered = np.convolve(case.reference, SECONDARY)[: case.reference.size]
+    case: Rated = make_rated(PLANT, noises()["band noise"][1](), 0.25)
+    filtered = np.convolve(case.reference, PLANT.secondary[0, 0])[: case.reference.size]
     begin = case.disturbance.size - case.after.size
     rows = np.lib.stride_tricks.sliding_window_view(filtered, TAPS)[begin - TAPS + 1 :, ::-1]
     weights = np.linalg.lstsq(rows, case.after, rcond=None)[0]
     expected = case.reduction_db(case.after - rows @ weights)
-    found = kf_pb_cases.with_any_power(case.reference, case.disturbance, case.secondary, TAPS)
+    found = kf_pb_cases.with_any_power(case.reference, case.disturbance, PLANT, TAPS)
     assert case.reduction_db(found.error) == pytest.approx(expected, abs=0.1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import replace
 from math import erf, exp, pi, sqrt
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from comparisons.studies.duct_start import Start
 from comparisons.studies.report_parts import first_second_db
 from comparisons.studies.weight_errors import WEIGHTS_EVERY, first_below_s, settled_after_s, weight_error
 from comparisons.studies.weight_growth import Growth, growth_of
+from kfopc_filterpy import Plant
 from kfopc_filterpy.signals import band_limited_noise
 
 FS = duct.FS
@@ -136,7 +136,8 @@ def test_times_at_which_a_curve_settles() -> None:
 def test_q_with_clipping_is_that_of_a_clipped_gaussian() -> None:
     """Flat paths, white noise: y is Gaussian, so Price's theorem gives what is clipped off and proportional to y."""
     noise = np.random.default_rng(3).standard_normal(200_000)
-    scene = make_scene({0: noise}, [0.0, 1.0], [1.0], fs=FS, rated_power=0.8, power_multiple=4.0, n_taps=4)
+    flat = Plant([1.0], [0.0, 1.0], fs=FS)
+    scene = make_scene({0: noise}, flat, rated_power=0.8, power_multiple=4.0, n_taps=4)
     scene = dataclasses.replace(scene, sensor_noise_std=0.0)
     limited = with_clipping(scene)
     a = sqrt(2.0)  # the limit over the standard deviation of y
@@ -166,7 +167,9 @@ def test_the_first_second_below_one_is_found() -> None:
 @pytest.fixture(scope="module")
 def scene() -> Any:
     noise = band_limited_noise((200.0, 1000.0), 3.0, fs=FS, rng=1)
-    return make_scene({1: noise}, [0, 0, 0, 1.0], [0, 1.0], fs=FS, rated_power=0.5, power_multiple=4.0, n_taps=16)
+    return make_scene(
+        {1: noise}, Plant([0, 1.0], [0, 0, 0, 1.0], fs=FS), rated_power=0.5, power_multiple=4.0, n_taps=16
+    )
 
 
 def test_both_start_where_the_constraint_acts_and_with_equal_power(scene: Any) -> None:
@@ -191,7 +194,7 @@ def test_the_common_level_is_that_of_the_lesser(scene: Any) -> None:
     def course(at_s: float, reduction_db: float) -> Any:
         """A run that reduces the noise from a time on."""
         late = np.arange(d.size) >= at_s * FS
-        return SimpleNamespace(error=np.where(late, d * 10 ** (-reduction_db / 20), d), disturbance=d)
+        return single_result(d.size, FS, error=np.where(late, d * 10 ** (-reduction_db / 20), d), disturbance=d)
 
     lesser, better = course(0.2, 5.0), course(0.1, 20.0)
     one, other = duct_start.times_to_a_common_level(lesser, better)

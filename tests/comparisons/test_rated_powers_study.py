@@ -14,7 +14,7 @@ from comparisons.bench import registry as algorithms
 from comparisons.studies import rated_powers
 from comparisons.studies.cases import Case, make_case, noises
 from comparisons.studies.rated_powers import BOUND, RECORD, SCALED, BudgetRow, _claims, mean_rows
-from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener
+from kfopc_filterpy import power_constrained_wiener
 
 TAPS, DURATION_S = 16, 1.0
 CASE = Case("duct", "band noise")
@@ -30,12 +30,12 @@ def small() -> Any:
         "SHARES_DB": SHARES,
         "SHOWN_DB": SHARES[0],
         "SEEDS": (1, 2),
-        "paths": short_duct,
+        "plants": short_duct,
     }
     studied = (CASE, Case("measured duct", "motor"))
     with few_settings(), smaller(rated_powers, CASES=studied, **constants):
-        pair, noise = short_duct()["duct"], noises()["band noise"]
-        first, scene = (make_case(pair, noise(DURATION_S + 0.5, seed), n_taps=TAPS) for seed in (1, 2))
+        plant, noise = short_duct()["duct"], noises()["band noise"]
+        first, scene = (make_case(plant, noise(DURATION_S + 0.5, seed), n_taps=TAPS) for seed in (1, 2))
         rated = replace(
             first,
             rated_power=0.1,
@@ -48,11 +48,9 @@ def small() -> Any:
         again = {name: run_setting(rated, name, settings[name], 1) for name in ("KF-OPC", "leaky FxLMS", "FxLMS")}
         bound = power_constrained_wiener(
             scene.references[0],
-            scene.disturbances[0],
-            scene.secondary,
-            TAPS,
-            0.1,
-            fs=16000.0,
+            plant,
+            n_taps=TAPS,
+            rated_power=0.1,
             switch_on_s=0.5,
             ridge=scene.measurement_noise / (scene.settled[0].size * scene.initial_variance),
         ).noise_reduction_over(0.5 * DURATION_S)
@@ -64,10 +62,8 @@ def test_rows_are_what_plain_runs_give(small: Any) -> None:
     rows = {(r["algorithm"], r["share_db"]): r for r in small[0].extra["rows"] if r["seed"] == 2}
     for name, result in small[1].items():
         row = rows[name, -10.0]
-        assert row["noise_reduction_db"] == pytest.approx(
-            noise_reduction_db(result.error, result.disturbance), rel=1e-9
-        )
-        assert row["power"] == pytest.approx(output_power(result.control_signal) / 0.1, rel=1e-9)
+        assert row["noise_reduction_db"] == pytest.approx(result.noise_reduction_db, rel=1e-9)
+        assert row["power"] == pytest.approx(result.output_power / 0.1, rel=1e-9)
     # Outside its band the noise has no energy: there rounding decides about the weights.
     assert rows[BOUND, -10.0]["noise_reduction_db"] == pytest.approx(small[2]["whole"], rel=1e-6)
     assert rows[SCALED, -10.0]["noise_reduction_db"] == pytest.approx(small[2]["scaled"], rel=1e-6)

@@ -17,11 +17,12 @@ from comparisons.rivals import (
     SubfilterKalman,
 )
 from comparisons.rivals.subfilters import band_subfilters
-from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener, simulate
+from kfopc_filterpy import Plant, noise_reduction_db, output_power, power_constrained_wiener, simulate
 from kfopc_filterpy.bounds import wiener_solution
 
 FS, L = 8000.0, 32
 SECONDARY = np.array([0.0, 0.0, 0.8, 0.3, -0.2])
+PLANT = Plant(SECONDARY, fs=FS)
 PRIMARY = np.concatenate((np.zeros(6), 0.8 ** np.arange(20.0) * np.cos(np.arange(20.0))))
 
 
@@ -34,7 +35,7 @@ def coloured(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def run(controller: Any, x: np.ndarray, d: np.ndarray) -> Any:
-    return simulate(controller, x, disturbance=d, secondary_path=SECONDARY, fs=FS)
+    return simulate(controller, x, PLANT, disturbance=d)
 
 
 @pytest.mark.parametrize("forgetting", [1.0, 0.999])
@@ -63,7 +64,7 @@ def test_the_fast_array_is_the_weighted_least_squares(forgetting: float) -> None
 def test_it_settles_near_the_best_filter(controller: Any, loss_db: float) -> None:
     x, d = coloured(48000)
     result = run(controller, x, d)
-    best = wiener_solution(x, d, SECONDARY, n_taps=L).noise_reduction_db
+    best = wiener_solution(x, PLANT, n_taps=L, disturbance=d).noise_reduction_db
     assert best - loss_db < noise_reduction_db(result.error, d) < best + 0.1
 
 
@@ -77,9 +78,11 @@ def test_a_band_that_only_delays_is_stacked_into_a_delay() -> None:
 
 def test_power_limited_fxlms_settles_at_the_power_constrained_wiener_solution() -> None:
     x, d = coloured(48000)
-    rated = 0.25 * wiener_solution(x, d, SECONDARY, n_taps=L).control_power
+    rated = 0.25 * wiener_solution(x, PLANT, n_taps=L, disturbance=d).control_power
     result = run(PowerLimitedFxLMS(L, SECONDARY, step_size=0.1, block_size=16, rated_power=rated), x, d)
-    bound = power_constrained_wiener(x, d, SECONDARY, L, rated_power=rated, fs=FS, switch_on_s=x.size / FS / 2).whole
+    bound = power_constrained_wiener(
+        x, PLANT, n_taps=L, rated_power=rated, switch_on_s=x.size / FS / 2, disturbance=d
+    ).whole
     assert output_power(result.control_signal) == pytest.approx(rated, rel=0.02)
     assert noise_reduction_db(result.error, d) == pytest.approx(bound.noise_reduction_db, abs=0.1)
 
@@ -87,8 +90,10 @@ def test_power_limited_fxlms_settles_at_the_power_constrained_wiener_solution() 
 def subfilter_run(rated_power: float) -> tuple[SubfilterKalman, Any, np.ndarray, np.ndarray]:
     """Return a run, and the outputs of its sub-filters before and after the secondary path, (n, C)."""
     x, d = coloured(24000)
-    bank = band_subfilters(wiener_solution(x, d, SECONDARY, n_taps=L).weights, 5)
-    np.testing.assert_allclose(bank.sum(axis=0), wiener_solution(x, d, SECONDARY, n_taps=L).weights, rtol=0, atol=1e-12)
+    bank = band_subfilters(wiener_solution(x, PLANT, n_taps=L, disturbance=d).weights, 5)
+    np.testing.assert_allclose(
+        bank.sum(axis=0), wiener_solution(x, PLANT, n_taps=L, disturbance=d).weights, rtol=0, atol=1e-12
+    )
     noises = {"state_noise": 0.0, "measurement_noise": 1e-3}
     controller = SubfilterKalman(L, SECONDARY, subfilters=bank, rated_power=rated_power, fs=FS, **noises)
     result = run(controller, x, d)

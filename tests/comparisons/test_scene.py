@@ -7,22 +7,15 @@ import pytest
 from helpers.channels import dense_systems, random_paths, through
 
 from comparisons.bench import Scene, Trial, algorithms, best_setting, make_controller, make_scene, run_setting
+from kfopc_filterpy import Plant
 
 FS = 16000.0
 
 
 def scene_of(n_taps: int, seeds: tuple[int, ...] = (3,)):
     noises = {seed: np.random.default_rng(seed).standard_normal(6000) for seed in seeds}
-    return make_scene(
-        noises,
-        [0.0, 0.0, 1.0, 0.4],
-        [0.0, 0.8, 0.2],
-        fs=FS,
-        rated_power=0.5,
-        power_multiple=4.0,
-        n_taps=n_taps,
-        switch_on_s=0.1,
-    )
+    plant = Plant([0.0, 0.8, 0.2], [0.0, 0.0, 1.0, 0.4], fs=FS)
+    return make_scene(noises, plant, rated_power=0.5, power_multiple=4.0, n_taps=n_taps, switch_on_s=0.1)
 
 
 @pytest.mark.parametrize("n_taps", [8, 32, 128])
@@ -81,18 +74,10 @@ def test_runs_together_hear_the_sensor_noise_of_their_seed():
 @pytest.fixture(scope="module")
 def channels() -> Scene:
     """Two references, three microphones, two loudspeakers of unlike ratings; the second noise is twice as loud."""
-    primary, secondary = random_paths(3, 2, 20, seed=1, delay=6), random_paths(3, 2, 12, seed=2)
+    plant = Plant(random_paths(3, 2, 12, seed=2), random_paths(3, 2, 20, seed=1, delay=6), fs=FS)
     noises = {k: k * np.random.default_rng(k).standard_normal((2, 4000)) for k in (1, 2)}
-    return make_scene(
-        noises,
-        primary,
-        secondary,
-        fs=FS,
-        rated_power=np.array([0.2, 0.6]),
-        power_multiple=3.0,
-        n_taps=8,
-        switch_on_s=0.1,
-    )
+    ratings = np.array([0.2, 0.6])
+    return make_scene(noises, plant, rated_power=ratings, power_multiple=3.0, n_taps=8, switch_on_s=0.1)
 
 
 def test_level_of_several_channels_asks_for_a_multiple_of_all_ratings(channels):
@@ -148,18 +133,16 @@ def test_budget_is_kept_if_every_loudspeaker_keeps_its_own(channels):
     [
         ({"rated_power": [-1.0, 2.0]}, "rated_power must be"),
         ({"rated_power": np.ones(3)}, "one for each of the 2 loudspeakers"),
-        ({"primary": [0.0, 1.0], "secondary": [1.0], "rated_power": np.ones(2)}, "rated_power"),
-        ({"primary": np.ones((3, 1, 20))}, "I = 2 of reference"),
+        ({"plant": Plant([1.0], [0.0, 1.0], fs=FS)}, "reference must have the 1 channel"),
         ({"switch_on_s": 1.0}, "longer than switch_on_s"),
     ],
-    ids=["negative", "three", "two of one", "one reference", "short"],
+    ids=["negative", "three", "one channel", "short"],
 )
 def test_channels_that_do_not_fit_are_refused(changed, match):
-    paths = {"primary": random_paths(3, 2, 20, seed=1), "secondary": random_paths(3, 2, 12, seed=2)}
-    settings = {"fs": FS, "rated_power": 1.0, "power_multiple": 3.0, "n_taps": 8, "switch_on_s": 0.1}
-    x = np.random.default_rng(0).standard_normal((2, 4000))
-    with pytest.raises((TypeError, ValueError), match=match):
-        make_scene({0: x[0] if "secondary" in changed else x}, **paths | settings | changed)
+    plant = Plant(random_paths(3, 2, 12, seed=2), random_paths(3, 2, 20, seed=1), fs=FS)
+    settings = {"plant": plant, "rated_power": 1.0, "power_multiple": 3.0, "n_taps": 8, "switch_on_s": 0.1}
+    with pytest.raises(ValueError, match=match):
+        make_scene({0: np.random.default_rng(0).standard_normal((2, 4000))}, **settings | changed)
 
 
 def test_an_algorithm_of_one_channel_is_refused_by_name(channels):

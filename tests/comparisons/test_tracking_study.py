@@ -12,7 +12,7 @@ from comparisons.studies import cases, tracking
 from comparisons.studies import tracking_events as events
 from comparisons.studies.tracking import TrackingRow
 from comparisons.studies.tracking_events import CHIRP_HZ, SWEEP_S, Event, change_scene, jump_scene, sweep
-from kfopc_filterpy import convergence_time_s, noise_reduction_db
+from kfopc_filterpy import Plant, convergence_time_s, noise_reduction_db
 from kfopc_filterpy.metrics import overshoot
 
 FS = 16000.0
@@ -50,12 +50,12 @@ def test_a_row_is_that_of_plain_runs(small: Any, algorithm: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[np.ndarray, np.ndarray]:
+def plant() -> Plant:
     """A delay with an echo, and a shorter delay."""
     primary, secondary = np.zeros(30), np.zeros(10)
     primary[[20, 25]] = 1.0, 0.5
     secondary[5] = 1.0
-    return primary, secondary
+    return Plant(secondary, primary, fs=FS)
 
 
 def test_a_sweep_has_the_frequencies_it_says() -> None:
@@ -72,17 +72,16 @@ def test_a_sweep_has_the_frequencies_it_says() -> None:
     assert np.max(np.abs(frequency / expected - 1.0)) < 0.02
 
 
-def test_a_path_changes_at_its_sample(pair: Any) -> None:
-    scene = change_scene(pair, 1, -pair[0])
-    x, d = scene.references[0], scene.disturbances[0]
+def test_a_path_changes_at_its_sample(plant: Any) -> None:
+    scene = change_scene(plant, 1, -plant.primary)
+    d, one = scene.disturbances[0], plant.disturbance(scene.references[0])
     at = round(2.5 * FS)
-    one = np.convolve(x, pair[0])[: x.size]
     assert np.allclose(d[:at], one[:at], atol=1e-12)
     assert np.allclose(d[at:], -one[at:], atol=1e-12)
 
 
-def test_a_jump_is_of_the_reference(pair: Any) -> None:
-    scene = jump_scene(pair, 1, 20.0)
+def test_a_jump_is_of_the_reference(plant: Any) -> None:
+    scene = jump_scene(plant, 1, 20.0)
     x = scene.references[0]
     louder = slice(round(2.0 * FS), round(3.5 * FS))
     usual = np.concatenate([x[: louder.start], x[louder.stop :]])
@@ -101,7 +100,7 @@ def test_events_say_where_they_happen() -> None:
 
 
 def test_an_algorithm_without_a_setting_is_lost() -> None:
-    event = Event("sign", lambda pair, seed: None, {"changed": (0.0, 1.0)})  # type: ignore[arg-type,return-value]
+    event = Event("sign", lambda plant, seed: None, {"changed": (0.0, 1.0)})  # type: ignore[arg-type,return-value]
     row, course = tracking.run_event(event, "duct", [], {"FxLMS": None}, "FxLMS")
     assert (row.diverged_at_s, course) == (0.0, None)
     assert np.isnan(row.noise_reduction_db)

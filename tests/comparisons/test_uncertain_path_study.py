@@ -18,15 +18,15 @@ from comparisons.studies.uncertain_path import (
     AllowanceRow,
     seconds_db,
 )
-from kfopc_filterpy import SimulationResult, simulate
+from kfopc_filterpy import Plant, SimulationResult, simulate
 
-PRIMARY, SECONDARY = np.array([0.0] * 8 + [0.8, 0.4]), np.array([0.0, 0.0, 0.0, 1.0, -0.6])
+PLANT = Plant([0.0, 0.0, 0.0, 1.0, -0.6], [0.0] * 8 + [0.8, 0.4], fs=16000)
 
 
 @pytest.fixture(scope="module")
 def report() -> StudyReport:
     """Few taps, two seconds, one pair of short paths, two noises, no measured data."""
-    with smaller(uncertain_path, paths=lambda: {"duct": (PRIMARY, SECONDARY)}, N_TAPS=16, DURATION_S=2.0):
+    with smaller(uncertain_path, plants=lambda: {"duct": PLANT}, N_TAPS=16, DURATION_S=2.0):
         noises = uncertain_path.study_noises()
         assert list(noises) == ["compressor", "band noise", "wide band", "white", "high tone"]
         with smaller(uncertain_path, study_noises=lambda: {name: noises[name] for name in ("band noise", "white")}):
@@ -43,15 +43,15 @@ def test_the_default_costs_little_and_the_rated_power_is_kept(report: StudyRepor
 
 
 def test_the_identified_path_is_near_the_true_one_and_within_its_uncertainty() -> None:
-    taps, uncertainty = uncertain_path.known_paths((PRIMARY, SECONDARY))[IDENTIFIED]
-    true, found = np.fft.rfft([SECONDARY, taps], 512)
+    taps, uncertainty = uncertain_path.known_paths(PLANT)[IDENTIFIED]
+    true, found = np.fft.rfft([PLANT.secondary[0, 0], taps], 512)
     assert 0.0 < np.max(np.abs(true / found - 1)) < 0.02
     assert np.all(np.abs(true / found - 1) < uncertainty)
 
 
 def test_each_second_counts_by_itself() -> None:
     x = np.ones(35)
-    result: SimulationResult = simulate(_Half(), x, disturbance=x, secondary_path=[1.0], fs=10.0)
+    result: SimulationResult = simulate(_Half(), x, Plant([1.0], fs=10), disturbance=x)
     assert seconds_db(result) == pytest.approx([20 * np.log10(2.0)] * 2 + [0.0])
 
 

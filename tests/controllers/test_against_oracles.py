@@ -20,23 +20,24 @@ from oracles.powers import Constraint
 from oracles.rls import FxRLS
 
 from kfopc_filterpy import (
-    ClippingFxLMS,
-    DiagonalKalman,
-    FxLMS,
-    FxNLMS,
     HardClipAmplifier,
-    LeakyFxLMS,
-    MOVFxLMS,
-    OptimalLeakyFxLMS,
     OutputLimiter,
     OutputPowerConstraint,
-    RescalingFxLMS,
+    Plant,
     SoftSaturationAmplifier,
-    TwoGradientFxLMS,
+    clipping_fx_lms,
+    diagonal_kf,
+    fx_lms,
+    fx_nlms,
     fx_rls,
     kf_anc,
     kf_opc,
+    leaky_fx_lms,
+    mov_fx_lms,
+    optimal_leaky_fx_lms,
+    rescaling_fx_lms,
     simulate,
+    two_gradient_fx_lms,
 )
 from kfopc_filterpy.paths import PathTolerance, guard_filter
 
@@ -90,8 +91,8 @@ def compare(
     x, d = scene.noises(n)
     paths = scene.s[0, 0] if scene.one else scene.s
     own = (x[0], d[0]) if scene.one else (x, d)
-    options: dict[str, Any] = {"secondary_path": paths, "fs": FS, "amplifier": amplifier, "switch_on_s": on / FS}
-    result = simulate(controller, own[0], disturbance=own[1], **options)
+    plant = Plant(paths, amplifier=amplifier, fs=FS)
+    result = simulate(controller, own[0], plant, disturbance=own[1], switch_on_s=on / FS)
     amplifiers = None if played is None else [played] * scene.loudspeakers
     expected = signals.run(oracle, x, d, scene.s, amplifiers=amplifiers, on=on)
     assert result.diverged_at_s is None
@@ -111,21 +112,31 @@ MU = 1e-3
 Algorithm = tuple[Callable[..., Any], Any, dict[str, Any], dict[str, Any]]
 
 LMS: dict[str, Algorithm] = {
-    "FxLMS": (FxLMS, lms.FxLMS, {"step_size": MU}, {"mu": MU}),
-    "FxNLMS": (FxNLMS, lms.FxNLMS, {"step_size": 0.05, "regularization": 0.5}, {"mu": 0.05, "epsilon": 0.5}),
-    "leaky": (LeakyFxLMS, lms.LeakyFxLMS, {"step_size": MU, "leak": LEAK}, {"mu": MU, "gamma": LEAK}),
-    "optimal leaky": (OptimalLeakyFxLMS, lms.OptimalLeakyFxLMS, {"step_size": MU}, {"mu": MU}),
-    "MOV": (MOVFxLMS, lms.MOVFxLMS, {"step_size": MU}, {"mu": MU}),
-    "MOV fixed": (MOVFxLMS, lms.MOVFxLMS, {"step_size": MU, "penalty_factor": PENALTY}, {"mu": MU, "gamma": PENALTY}),
-    "MOV modified": (MOVFxLMS, lms.MOVFxLMS, {"step_size": MU, "modified": True}, {"mu": MU, "modified": True}),
+    "FxLMS": (fx_lms, lms.FxLMS, {"step_size": MU}, {"mu": MU}),
+    "FxNLMS": (fx_nlms, lms.FxNLMS, {"step_size": 0.05, "regularization": 0.5}, {"mu": 0.05, "epsilon": 0.5}),
+    "leaky": (leaky_fx_lms, lms.LeakyFxLMS, {"step_size": MU, "leak": LEAK}, {"mu": MU, "gamma": LEAK}),
+    "optimal leaky": (optimal_leaky_fx_lms, lms.OptimalLeakyFxLMS, {"step_size": MU}, {"mu": MU}),
+    "MOV": (mov_fx_lms, lms.MOVFxLMS, {"step_size": MU}, {"mu": MU}),
+    "MOV fixed": (
+        mov_fx_lms,
+        lms.MOVFxLMS,
+        {"step_size": MU, "penalty_factor": PENALTY},
+        {"mu": MU, "gamma": PENALTY},
+    ),
+    "MOV modified": (mov_fx_lms, lms.MOVFxLMS, {"step_size": MU, "modified": True}, {"mu": MU, "modified": True}),
     "two-gradient": (
-        TwoGradientFxLMS,
+        two_gradient_fx_lms,
         lms.TwoGradientFxLMS,
         {"step_size": MU, "amplitude_limit": A, "output_step_size": 2 * MU},
         {"mu": MU, "A": A, "mu_y": 2 * MU},
     ),
-    "clipping": (ClippingFxLMS, lms.ClippingFxLMS, {"step_size": MU / 4, "amplitude_limit": A}, {"mu": MU / 4, "A": A}),
-    "re-scaling": (RescalingFxLMS, lms.RescalingFxLMS, {"step_size": MU, "amplitude_limit": A}, {"mu": MU, "A": A}),
+    "clipping": (
+        clipping_fx_lms,
+        lms.ClippingFxLMS,
+        {"step_size": MU / 4, "amplitude_limit": A},
+        {"mu": MU / 4, "A": A},
+    ),
+    "re-scaling": (rescaling_fx_lms, lms.RescalingFxLMS, {"step_size": MU, "amplitude_limit": A}, {"mu": MU, "A": A}),
 }
 
 R, Q, P0, LAMBDA = 1e-6, [1e-2, 3e-2, 2e-2], 0.5, 0.9995
@@ -137,8 +148,8 @@ ONE_NOISE: tuple[dict[str, Any], dict[str, Any]] = OURS | {"measurement_noise": 
 SEVERAL_KALMAN: dict[str, Algorithm] = {  # several channels, too
     "KF-ANC": (kf_anc, Kalman, OURS, THEIRS),
     "KF-OPC": (kf_opc, Kalman, OURS, THEIRS),
-    "diagonal KF": (DiagonalKalman, DiagonalOracle, *ONE_NOISE),
-    "diagonal KF-OPC": (DiagonalKalman, DiagonalOracle, *ONE_NOISE),
+    "diagonal KF": (diagonal_kf, DiagonalOracle, *ONE_NOISE),
+    "diagonal KF-OPC": (diagonal_kf, DiagonalOracle, *ONE_NOISE),
 }
 KALMAN: dict[str, Algorithm] = SEVERAL_KALMAN | {
     "FxRLS": (fx_rls, FxRLS, {"forgetting": LAMBDA}, {"forgetting": LAMBDA}),
@@ -227,7 +238,7 @@ def test_a_loudspeaker_that_no_microphone_hears(name: str) -> None:
     controller, oracle = pair(name, scene)
     x, d = scene.noises(300)
     expected = signals.run(oracle, x, d, scene.s)
-    result = simulate(controller, x, disturbance=d, secondary_path=scene.s, fs=FS)
+    result = simulate(controller, x, Plant(scene.s, fs=FS), disturbance=d)
     np.testing.assert_allclose(result.constraint_factor, expected.alphas, rtol=0, atol=TOLERANCE)
     np.testing.assert_allclose(controller.weights, expected.w, rtol=0, atol=TOLERANCE)
     assert np.any(controller.weights != 0.0)

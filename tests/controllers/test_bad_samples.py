@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.checkpoints import Room
 from helpers.controllers import ALL
-from helpers.rooms import Room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy import FxLMS, FxNLMS, LimitedController, OutputLimiter, fx_rls, simulate
+from kfopc_filterpy import LimitedController, OutputLimiter, Plant, fx_lms, fx_nlms, fx_rls, simulate
 from kfopc_filterpy.checkpoint import content_of
 from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.signals import band_limited_noise, tone
@@ -67,9 +67,12 @@ def test_a_refused_sample_leaves_the_saved_state_as_it_was(name: str, half: str,
 
 
 @pytest.mark.parametrize("half", ["control_signal", "update"])
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", [name for name in ALL if name != "FeedbackNeutralizer"])
 def test_a_huge_sample_is_overcome(name: str, half: str) -> None:
-    """In a closed loop; 1000 samples later nothing is refused, and nothing is infinite."""
+    """In a closed loop; 1000 samples later nothing is refused, and nothing is infinite.
+
+    This room has no feedback: with the huge weights that FxLMS has learned, what is subtracted for it is an unstable loop.
+    """
     for value in HUGE:
         controller = ALL[name]()
         room, refusals = Room(controller), 0
@@ -93,7 +96,7 @@ NOISES: dict[str, Any] = {
 }
 MAKERS: dict[str, Any] = {
     "FxRLS": lambda: fx_rls(32, S, forgetting=0.999),
-    "FxNLMS": lambda: FxNLMS(32, S, step_size=0.1),
+    "FxNLMS": lambda: fx_nlms(32, S, step_size=0.1),
 }
 
 
@@ -105,9 +108,9 @@ def test_a_quiet_passage_makes_nothing_loud(name: str, noise: str, quiet: float)
     x = NOISES[noise](14 * FS)
     x[n:-n] *= quiet
     controller = MAKERS[name]()
-    result = simulate(controller, x, primary_path=P, secondary_path=S, fs=FS, sensor_noise_std=1e-3, rng=3)
+    result = simulate(controller, x, Plant(S, P, fs=FS, sensor_noise_std=1e-3), rng=3)
     assert np.max(np.abs(result.control_signal[-n:])) < 1.3 * np.max(np.abs(result.control_signal[:n]))
-    after = simulate(controller, NOISES[noise](n), primary_path=-P, secondary_path=S, fs=FS)
+    after = simulate(controller, NOISES[noise](n), Plant(S, -P, fs=FS))
     assert np.mean(after.error[FS:] ** 2) < 1e-3 * np.mean(after.disturbance[FS:] ** 2)
 
 
@@ -121,7 +124,7 @@ def test_a_silent_start_makes_nothing_loud(noise: str) -> None:
     peaks = []
     for start in (silent, silent[:0]):
         x = np.r_[start, NOISES[noise](n)]
-        result = simulate(MAKERS["FxRLS"](), x, primary_path=P, secondary_path=S, fs=FS, sensor_noise_std=1e-3, rng=3)
+        result = simulate(MAKERS["FxRLS"](), x, Plant(S, P, fs=FS, sensor_noise_std=1e-3), rng=3)
         peaks.append(np.max(np.abs(result.control_signal[-n:])))
         assert np.mean(result.error[-FS:] ** 2) < 1e-3 * np.mean(result.disturbance[-FS:] ** 2)
     assert peaks[0] < 1.3 * peaks[1]
@@ -133,7 +136,7 @@ def test_a_silent_start_makes_nothing_loud(noise: str) -> None:
 def test_defaults_scale_with_the_signal(name: str, scale: float) -> None:
     """FxRLS begins with the variance of a unit signal: for 1e-5, P has to grow by up to 1e6."""
     x = scale * NOISES["white"](6 * FS)
-    result = simulate(MAKERS[name](), x, primary_path=P, secondary_path=S, fs=FS)
+    result = simulate(MAKERS[name](), x, Plant(S, P, fs=FS))
     assert np.mean(result.error[-FS // 2 :] ** 2) < 1e-3 * np.mean(result.disturbance[-FS // 2 :] ** 2)
 
 
@@ -142,17 +145,17 @@ def test_defaults_scale_with_the_signal(name: str, scale: float) -> None:
 
 def test_a_second_thread_is_refused_and_the_first_one_is_unharmed() -> None:
     x, e = np.random.default_rng(0).standard_normal((2, 3_000_000))
-    controller, alone = (FxLMS(64, S, step_size=1e-6) for _ in range(2))
+    controller, alone = (fx_lms(64, S, step_size=1e-6) for _ in range(2))
     expected, answers = alone.process(x, e), []
     calls = [
         lambda: controller.process(x[:10], e[:10]),
         lambda: controller.control_signal(1.0),
         lambda: controller.update(1.0),
         lambda: controller.listen(x[:10], e[:10]),
-        lambda: setattr(controller, "secondary_path", S),
-        lambda: setattr(controller, "limiter", OutputLimiter(1.0)),
+        lambda: setattr(controller, "secondary", S),
+        lambda: setattr(controller, "limiter", OutputLimiter(1.0, fs=16000)),
         lambda: pickle.dumps(controller),
-        lambda: simulate(controller, x[:10], disturbance=e[:10], secondary_path=S),
+        lambda: simulate(controller, x[:10], Plant(S, fs=FS), disturbance=e[:10]),
     ]
     running = threading.Thread(target=lambda: answers.append(controller.process(x, e)))
     running.start()
@@ -181,7 +184,11 @@ class Patient:
 
 
 @pytest.mark.parametrize(
-    "wrap", [lambda own: LimitedController(own, OutputLimiter(4.0)), lambda own: FeedbackNeutralizer(own, [0.0, 0.1])]
+    "wrap",
+    [
+        lambda own: LimitedController(own, OutputLimiter(4.0, fs=FS)),
+        lambda own: FeedbackNeutralizer(own, [0.0, 0.1]),
+    ],
 )
 def test_a_second_thread_is_refused_by_a_wrapper_of_ones_own_controller(wrap: Any) -> None:
     own, answers = Patient(), []
@@ -193,7 +200,7 @@ def test_a_second_thread_is_refused_by_a_wrapper_of_ones_own_controller(wrap: An
         lambda: controller.control_signal(2.0),
         lambda: controller.update(1.0),
         lambda: controller.process([2.0], [1.0]),
-        lambda: simulate(controller, [2.0], disturbance=[1.0], secondary_path=S),
+        lambda: simulate(controller, [2.0], Plant(S, fs=FS), disturbance=[1.0]),
     ):
         with pytest.raises(RuntimeError, match="in use by another thread"):
             call()

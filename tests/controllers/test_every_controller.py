@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.channels import random_paths
+from helpers.checkpoints import Room
 from helpers.comparing import assert_same_run, numbers_of
 from helpers.controllers import ALL, IN_BLOCKS, PATHS, SEVERAL, VARIANTS, I, J, K, made
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, N_TAPS, run
-from helpers.rooms import Room
+from helpers.simulation import Stepwise
 
-from kfopc_filterpy import HardClipAmplifier, simulate
+from kfopc_filterpy import HardClipAmplifier, Plant, simulate
 
 
 @pytest.mark.parametrize(("name", "variant"), VARIANTS)
@@ -22,7 +23,7 @@ def test_compiled_run_is_the_steps_bit_for_bit(name: str, variant: str) -> None:
     fast, slow = made(name, variant), made(name, variant)
     scene = {"amplifier": AMPLIFIERS["soft"][0], "feedback": FEEDBACK, "on": 17, "n": 300}
     result = run(fast, **scene)
-    assert_same_run(result, run(slow, compiled=False, **scene))
+    assert_same_run(result, run(Stepwise(slow), **scene))
     np.testing.assert_array_equal(fast.weights, slow.weights)
     for mine, theirs in zip(numbers_of(fast.constraint.state), numbers_of(slow.constraint.state), strict=True):
         np.testing.assert_array_equal(mine, theirs)
@@ -30,8 +31,8 @@ def test_compiled_run_is_the_steps_bit_for_bit(name: str, variant: str) -> None:
         assert pickle.dumps(fast.limiter) == pickle.dumps(slow.limiter)
         assert fast.limiter.gain < 1.0  # it did act
     assert np.any(np.abs(np.diff(result.weights, axis=0)) > 0)
-    assert_same_run(run(fast, n=50), run(slow, n=50, compiled=False))  # and they go on alike
-    assert_same_run(run(fast, n=50, compiled=False), run(slow, n=50))
+    assert_same_run(run(fast, n=50), run(Stepwise(slow), n=50))  # and they go on alike
+    assert_same_run(run(Stepwise(fast), n=50), run(slow, n=50))
 
 
 @pytest.mark.parametrize("name", SEVERAL)
@@ -39,43 +40,41 @@ def test_so_it_is_with_several_channels(name: str) -> None:
     """With feedback, amplifiers, sensor noise, and a controller that first listens; and they go on alike."""
     fast, slow = SEVERAL[name](), SEVERAL[name]()
     x = np.random.default_rng(3).standard_normal((I, 300))
-    options: dict[str, Any] = {
-        "primary_path": random_paths(K, I, 9, seed=2, delay=3),
-        "secondary_path": 1.1 * PATHS,
-        "feedback_path": 0.02 * random_paths(I, J, 5, seed=4),
-        "amplifier": [HardClipAmplifier(1.0), None],
-        "sensor_noise_std": 0.01,
-        "rng": 1,
-        "fs": FS,
-    }
+    plant = Plant(
+        1.1 * PATHS,
+        random_paths(K, I, 9, seed=2, delay=3),
+        feedback=0.02 * random_paths(I, J, 5, seed=4),
+        amplifier=[HardClipAmplifier(1.0), None],
+        fs=FS,
+        sensor_noise_std=0.01,
+    )
     both = [
-        simulate(one, x, compiled=one is fast, record_weights_every=7, switch_on_s=20 / FS, **options)
-        for one in (fast, slow)
+        simulate(one, x, plant, rng=1, record_weights_every=7, switch_on_s=20 / FS) for one in (fast, Stepwise(slow))
     ]
     assert_same_run(*both)
     np.testing.assert_array_equal(fast.weights, slow.weights)
-    assert_same_run(*(simulate(one, x[:, :50], compiled=one is slow, **options) for one in (fast, slow)))
+    assert_same_run(*(simulate(one, x[:, :50], plant, rng=1) for one in (Stepwise(fast), slow)))
 
 
 @pytest.mark.parametrize("name", IN_BLOCKS)
 def test_a_run_by_blocks_is_the_steps_bit_for_bit(name: str) -> None:
     """Also if the path changes within a block, if weights are recorded, and if it ends in a divergence."""
-    path, several = IN_BLOCKS[name]().secondary_path, "many" in name
+    path, several = IN_BLOCKS[name]().secondary, "many" in name
     rng = np.random.default_rng(5)
     x, d = rng.standard_normal((2, I, 200)), rng.standard_normal((2, K, 200))
     if not several:
         x, d = x[:, 0], d[:, 0]
-    options: dict[str, Any] = {
-        "secondary_path": [(0.0, path), (40 / FS, 0.9 * path)],
-        "fs": FS,
-        "sensor_noise_std": 0.1,
-    }
-    options |= {"amplifier": AMPLIFIERS["soft"][0], "record_weights_every": 5, "switch_on_s": 3 / FS, "rng": 1}
+    plant = Plant(path, amplifier=AMPLIFIERS["soft"][0], fs=FS, sensor_noise_std=0.1)
+    plant = plant.changed_at(40 / FS, secondary=0.9 * path)
+    options: dict[str, Any] = {"record_weights_every": 5, "switch_on_s": 3 / FS, "rng": 1}
 
-    def both(rated_power: float) -> Any:
+    def both(gain: float) -> Any:
         made = [IN_BLOCKS[name]() for _ in range(2)]
         runs = [
-            [simulate(one, x[k], disturbance=d[k], rated_power=rated_power, compiled=k == i, **options) for k in (0, 1)]
+            [
+                simulate(one if k == i else Stepwise(one), x[k], plant, disturbance=gain * d[k], **options)
+                for k in (0, 1)
+            ]
             for i, one in enumerate(made)
         ]
         for one, other in zip(*runs, strict=True):
@@ -85,8 +84,7 @@ def test_a_run_by_blocks_is_the_steps_bit_for_bit(name: str) -> None:
 
     result = both(1.0)
     assert result.diverged_at_s is None
-    peak = np.abs(result.control_signal).max()
-    assert both(float((0.9e-6 * peak) ** 2)).diverged_at_s > 0  # a run stops at 1e6 sqrt(rated_power)
+    assert both(1.1e6 / np.abs(result.control_signal).max()).diverged_at_s > 0  # a run stops at 1e6
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if "a user's" not in name])

@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 from helpers.controllers import KALMAN, MAKERS, MANY, PATHS, SEVERAL, VARIANTS, K, constraint, made
 from helpers.loop import AMPLIFIERS, FS, MU, N_TAPS, S_HAT, N, S, noises, run
+from helpers.simulation import Stepwise
 from scipy.signal import lfilter
 
 from kfopc_filterpy import (
     KFOPC,
-    FxLMS,
     KalmanController,
+    Plant,
+    fx_lms,
     kf_anc,
     kf_opc,
     kf_pb,
     simulate,
-    simulate_scenarios,
 )
 from kfopc_filterpy.bounds import power_constrained_solution, predictor_reference, wiener_solution
 from kfopc_filterpy.checkpoint import content_of
@@ -58,11 +59,10 @@ def test_the_loop_is_that_of_ten_lines_of_numpy() -> None:
     """With a path that is not exact and an amplifier that saturates; 1e-12 is the order of the additions."""
     amplifier, saturated = AMPLIFIERS["soft"]
     result = simulate(
-        with_internal_model(FxLMS(N_TAPS, S_HAT, step_size=MU)),
+        with_internal_model(fx_lms(N_TAPS, S_HAT, step_size=MU)),
         None,
+        Plant(S, amplifier=amplifier, fs=FS),
         disturbance=D,
-        secondary_path=S,
-        amplifier=amplifier,
     )
     x, filtered, y, amplified, e, w = *np.zeros((5, N)), np.zeros(N_TAPS)
     for n in range(N):
@@ -82,10 +82,10 @@ def test_with_an_exact_path_it_is_feedforward_control_of_the_noise_a_sample_late
     """Every algorithm, behind a limiter and with a known amplifier; d^ = (d - s*y) + s^*y is d to rounding."""
     one, other = (own_filter() if name == "filterpy's" else made(name, variant) for _ in range(2))
     amplifier = AMPLIFIERS["soft"][0] if variant == "known amplifier" else None
-    plant: dict[str, Any] = {"disturbance": D, "secondary_path": S_HAT, "fs": FS, "amplifier": amplifier}
-    plant["switch_on_s"] = 20 / FS
-    feedback = simulate(with_internal_model(one), None, **plant)
-    forward = simulate(other, predictor_reference(D), **plant)
+    plant = Plant(S_HAT, amplifier=amplifier, fs=FS)
+    options: dict[str, Any] = {"disturbance": D, "switch_on_s": 20 / FS}
+    feedback = simulate(with_internal_model(one), None, plant, **options)
+    forward = simulate(other, predictor_reference(D), plant, **options)
     atol = 1e-9 * np.abs(D).max()
     np.testing.assert_allclose(feedback.error, forward.error, rtol=0, atol=atol)
     assert np.abs(feedback.control_signal).max() > 0.01
@@ -99,9 +99,9 @@ def test_so_it_is_with_several_channels_and_reference_microphones(name: str) -> 
     x, d = rng.standard_normal((2, 300)), np.cumsum(rng.standard_normal((K, 300)), axis=1) / 10
     with mock.patch.dict(MANY, n_references=2 + K):
         one, other = SEVERAL[name](), SEVERAL[name]()
-    plant: dict[str, Any] = {"disturbance": d, "secondary_path": PATHS, "fs": FS}
-    hybrid = simulate(with_internal_model(one), x, **plant)
-    forward = simulate(other, np.concatenate((x, predictor_reference(d))), **plant)
+    plant = Plant(PATHS, fs=FS)
+    hybrid = simulate(with_internal_model(one), x, plant, disturbance=d)
+    forward = simulate(other, np.concatenate((x, predictor_reference(d))), plant, disturbance=d)
     np.testing.assert_allclose(hybrid.error, forward.error, rtol=0, atol=1e-9 * np.abs(d).max())
     assert np.any(hybrid.control_signal)
 
@@ -110,9 +110,9 @@ def test_so_it_is_with_several_channels_and_reference_microphones(name: str) -> 
 def test_runs_blocks_steps_and_copies_are_one_to_the_bit(name: str) -> None:
     """With sensor noise, a path that is not exact, a pause of the adaptation, and listening first."""
     fast, slow = (with_internal_model(own_filter() if name == "filterpy's" else MAKERS[name]()) for _ in range(2))
-    scene: dict[str, Any] = {"disturbance": D, "secondary_path": S, "fs": FS, "sensor_noise_std": 0.05, "rng": 1}
-    scene["switch_on_s"] = 20 / FS
-    one, two = simulate(fast, None, **scene), simulate(slow, None, compiled=False, **scene)
+    plant = Plant(S, fs=FS, sensor_noise_std=0.05)
+    options: dict[str, Any] = {"disturbance": D, "rng": 1, "switch_on_s": 20 / FS}
+    one, two = (simulate(each, None, plant, **options) for each in (fast, Stepwise(slow)))
     np.testing.assert_array_equal(one.error, two.error)
     adapt, errors = np.arange(100) % 3 > 0, one.error[-100:]
     expected = []
@@ -129,11 +129,11 @@ def test_runs_blocks_steps_and_copies_are_one_to_the_bit(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["FxLMS", "KF-OPC", "MOV", "diagonal KF"])
 def test_a_silent_reference_microphone_changes_nothing(name: str) -> None:
-    plant: dict[str, Any] = {"secondary_path": S[None, None], "fs": FS}
-    hybrid = simulate(with_internal_model(MAKERS[name](n_references=2)), np.zeros((1, N)), disturbance=D[None], **plant)
-    alone = simulate(with_internal_model(MAKERS[name]()), None, disturbance=D, secondary_path=S, fs=FS)
+    plant = Plant(S, fs=FS)
+    hybrid = simulate(with_internal_model(MAKERS[name](n_references=2)), np.zeros(N), plant, disturbance=D)
+    alone = simulate(with_internal_model(MAKERS[name]()), None, Plant(S, fs=FS), disturbance=D)
     atol = 1e-12 * np.abs(D).max()  # a Kalman filter adds in another order
-    np.testing.assert_allclose(hybrid.error[0], alone.error, rtol=0, atol=atol)
+    np.testing.assert_allclose(hybrid.error, alone.error, rtol=0, atol=atol)
 
 
 # Closed forms: an AR(1) disturbance of power 1 with the pole a, and a path g z^-D. The predictor over D + 1 samples is
@@ -154,7 +154,7 @@ def disturbance() -> np.ndarray:
 
 def settled(controller: Any, d: np.ndarray) -> tuple[float, float]:
     """Return the powers of error and control signal over the second half of a run, those of d being 1."""
-    result = simulate(with_internal_model(controller), None, disturbance=d, secondary_path=PURE_DELAY, fs=FS)
+    result = simulate(with_internal_model(controller), None, Plant(PURE_DELAY, fs=FS), disturbance=d)
     half = slice(d.size // 2, None)
     power = np.mean(d[half] ** 2)
     return float(np.mean(result.error[half] ** 2) / power), float(np.mean(result.control_signal[half] ** 2) / power)
@@ -165,7 +165,9 @@ SCATTER = 0.04
 
 
 def test_the_bound_and_the_settled_controller_are_the_best_predictor(disturbance: np.ndarray) -> None:
-    bound = wiener_solution(predictor_reference(disturbance), disturbance, PURE_DELAY, 8)
+    bound = wiener_solution(
+        predictor_reference(disturbance), Plant(PURE_DELAY, fs=FS), n_taps=8, disturbance=disturbance
+    )
     assert bound.error_power / bound.disturbance_power == pytest.approx(left_by(KEPT / GAIN), abs=SCATTER)
     np.testing.assert_allclose(bound.weights, np.eye(8)[0] * KEPT / GAIN, rtol=0, atol=0.05)
     kalman = kf_anc(8, PURE_DELAY, state_noise=1e-12, measurement_noise=0.3)
@@ -180,7 +182,9 @@ def test_within_a_rated_power_kf_pb_reaches_the_bound_and_kf_opc_its_scaled_filt
     disturbance: np.ndarray, rated: float
 ) -> None:
     """The bound takes w = sqrt(rho) d^(n - 1). KF-OPC scales the predictor by alpha, made for full cancellation."""
-    bound = power_constrained_solution(predictor_reference(disturbance), disturbance, PURE_DELAY, 8, rated)
+    bound = power_constrained_solution(
+        predictor_reference(disturbance), Plant(PURE_DELAY, fs=FS), n_taps=8, rated_power=rated, disturbance=disturbance
+    )
     assert bound.control_power == pytest.approx(rated, rel=1e-3)
     assert bound.error_power / bound.disturbance_power == pytest.approx(left_by(np.sqrt(rated)), abs=SCATTER)
     error, power = settled(kf_pb(8, PURE_DELAY, rated_power=rated, fs=FS, averaging_s=1.0), disturbance)
@@ -202,12 +206,12 @@ def test_hybrid_control_does_better_than_either(disturbance: np.ndarray) -> None
     both = simulate(
         with_internal_model(kf_anc(8, path, n_references=2, **noise)),
         white[None],
+        Plant(path, fs=FS),
         disturbance=d[None],
-        secondary_path=path,
     )
-    forward = simulate(kf_anc(8, PURE_DELAY, **noise), white, disturbance=d, secondary_path=PURE_DELAY)
+    forward = simulate(kf_anc(8, PURE_DELAY, **noise), white, Plant(PURE_DELAY, fs=FS), disturbance=d)
     feedback = simulate(
-        with_internal_model(kf_anc(8, PURE_DELAY, **noise)), None, disturbance=d, secondary_path=PURE_DELAY
+        with_internal_model(kf_anc(8, PURE_DELAY, **noise)), None, Plant(PURE_DELAY, fs=FS), disturbance=d
     )
     powers = [np.mean(one.error[..., d.size // 2 :] ** 2) for one in (both, forward, feedback)]
     assert powers[0] < 0.8 * min(powers[1:])
@@ -218,8 +222,8 @@ def test_hybrid_control_does_better_than_either(disturbance: np.ndarray) -> None
 
 
 def test_a_refused_error_leaves_the_state_and_one_that_never_comes_counts_as_silence() -> None:
-    controller = with_internal_model(kf_opc(N_TAPS, S_HAT, rated_power=0.3, **KALMAN))
-    run_before = simulate(controller, None, disturbance=D, secondary_path=S_HAT)
+    controller = with_internal_model(kf_opc(N_TAPS, S_HAT, rated_power=0.3, fs=FS, **KALMAN))
+    run_before = simulate(controller, None, Plant(S_HAT, fs=FS), disturbance=D)
     played = np.append(run_before.control_signal, controller.control_signal(None))
     before = content_of(controller)
     for bad in (np.nan, np.inf, 1e30, 1e160, "a"):
@@ -243,32 +247,31 @@ def test_a_refused_error_leaves_the_state_and_one_that_never_comes_counts_as_sil
         (lambda f: f.control_signal(1.0), "reference must be None"),
         (lambda f: f.process([1.0], [1.0]), "reference must be None"),
         (lambda f: f.listen([1.0], [1.0]), "reference must be None"),
-        (lambda f: simulate(f, D, disturbance=D, secondary_path=S), "reference must be None"),
-        (lambda f: simulate(f, None, primary_path=[1.0], secondary_path=S), "without a reference give disturbance="),
-        (lambda f: simulate_scenarios([f], D, disturbance=D, secondary_path=S), "internal model"),
+        (lambda f: simulate(f, D, Plant(S, fs=FS), disturbance=D), "reference must be None"),
+        (lambda f: simulate(f, None, Plant(S, [1.0], fs=FS)), "without a reference give disturbance="),
         (with_internal_model, "has an internal model"),
-        (lambda f: with_internal_model(FxLMS(4, PATHS, step_size=MU, n_references=K - 1)), "for each of the 3 error"),
+        (lambda f: with_internal_model(fx_lms(4, PATHS, step_size=MU, n_references=K - 1)), "for each of the 3 error"),
         (lambda f: FeedbackNeutralizer(f, [0.0, 1.0]), "n_references of 0"),
         (lambda f: Supervisor(f, fs=FS, amplitude_limit=1.0).process([1.0], [1.0]), "references must be None"),
         (
             lambda f: Supervisor(
-                VirtualMicrophones(f, np.ones((2, 1, 4)), [[[1.0]]], physical=[0]), amplitude_limit=1.0
+                VirtualMicrophones(f, np.ones((2, 1, 4)), [[[1.0]]], physical=[0]), fs=FS, amplitude_limit=1.0
             ),
             "must not have virtual microphones",
         ),
-        (lambda f: FxLMS(4, S, step_size=MU).control_signal(None), "with_internal_model"),
-        (lambda f: FxLMS(4, S, step_size=MU).process(None, [1.0]), "with_internal_model"),
-        (lambda f: simulate(FxLMS(4, S, step_size=MU), None, disturbance=D, secondary_path=S), "with_internal_model"),
-        (lambda f: with_internal_model(FeedbackNeutralizer(FxLMS(4, S, step_size=MU), [0.0, 1.0])), "wrap the result"),
+        (lambda f: fx_lms(4, S, step_size=MU).control_signal(None), "with_internal_model"),
+        (lambda f: fx_lms(4, S, step_size=MU).process(None, [1.0]), "with_internal_model"),
+        (lambda f: simulate(fx_lms(4, S, step_size=MU), None, Plant(S, fs=FS), disturbance=D), "with_internal_model"),
+        (lambda f: with_internal_model(FeedbackNeutralizer(fx_lms(4, S, step_size=MU), [0.0, 1.0])), "wrap the result"),
     ],
 )
 def test_what_is_refused(call: Any, message: str) -> None:
     with pytest.raises((ValueError, TypeError), match=message):
-        call(with_internal_model(FxLMS(4, S_HAT, step_size=MU)))
+        call(with_internal_model(fx_lms(4, S_HAT, step_size=MU)))
 
 
 def test_the_given_controller_stays_as_it_was() -> None:
-    controller = FxLMS(N_TAPS, S_HAT, step_size=MU)
+    controller = fx_lms(N_TAPS, S_HAT, step_size=MU)
     before = content_of(controller)
     made_from_it = with_internal_model(controller)
     assert content_of(controller) == before

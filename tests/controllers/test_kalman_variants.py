@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 
-from kfopc_filterpy import DiagonalKalman, fx_rls, kf_anc, simulate
+from kfopc_filterpy import Plant, diagonal_kf, fx_rls, kf_anc, simulate
 
 L = 6
-PATH = np.array([0.0, 0.8, -0.3])
+FS, PATH = 16000, np.array([0.0, 0.8, -0.3])
 
 
 def signals(n: int = 400, seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -24,7 +24,7 @@ def test_fxrls_is_the_weighted_least_squares(forgetting: float) -> None:
     """Normal equations over all samples, with the start's lambda^n / variance on the diagonal: a dense solve."""
     x, d = signals(300)
     controller = fx_rls(L, PATH, forgetting=forgetting, initial_variance=2.0)
-    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    simulate(controller, x, Plant(PATH, fs=FS), disturbance=d)
     H = toeplitz(np.convolve(x, PATH)[: x.size], np.zeros(L))
     weight = forgetting ** np.arange(x.size - 1, -1, -1.0)
     normal = H.T @ (weight[:, None] * H) + forgetting**x.size / 2.0 * np.eye(L)
@@ -41,9 +41,9 @@ def test_what_a_diagonal_covariance_loses_against_the_full_filter() -> None:
             x = np.convolve(x, colour)[: x.size]
             clean = np.convolve(x, np.r_[0.0, np.random.default_rng(100 + seed).standard_normal(32)])[: x.size]
             d = clean + 0.1 * other
-            for k, maker in enumerate((DiagonalKalman, kf_anc)):
+            for k, maker in enumerate((diagonal_kf, kf_anc)):
                 made: Any = maker(32, [0.0, 1.0], state_noise=1e-9, measurement_noise=0.01)
-                result = simulate(made, x, disturbance=d, secondary_path=[0.0, 1.0])
+                result = simulate(made, x, Plant([0.0, 1.0], fs=FS), disturbance=d)
                 excess[k] += np.mean((clean - result.anti_noise)[1024:] ** 2)
         losses.append(10 * np.log10(excess[0] / excess[1]))
     assert 0.0 < losses[0] < 3.0
@@ -51,12 +51,12 @@ def test_what_a_diagonal_covariance_loses_against_the_full_filter() -> None:
 
 
 def test_diagonal_variances_stay_positive_and_a_silent_reference_tells_nothing() -> None:
-    controller = DiagonalKalman(L, PATH, state_noise=0.0, measurement_noise=0.0)
-    result = simulate(controller, np.zeros(50), disturbance=np.ones(50), secondary_path=PATH)
+    controller = diagonal_kf(L, PATH, state_noise=0.0, measurement_noise=0.0)
+    result = simulate(controller, np.zeros(50), Plant(PATH, fs=FS), disturbance=np.ones(50))
     np.testing.assert_array_equal(result.error, np.ones(50))
     np.testing.assert_array_equal(controller.variances, np.ones(L))
     x, d = signals()
-    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    simulate(controller, x, Plant(PATH, fs=FS), disturbance=d)
     assert np.all(controller.variances >= 0.0)
     controller.variances[:] = -1.0  # a copy
     assert np.all(controller.variances >= 0.0)
@@ -65,7 +65,7 @@ def test_diagonal_variances_stay_positive_and_a_silent_reference_tells_nothing()
 
 def test_a_diagonal_step_that_would_be_too_large_is_left_out() -> None:
     """Without measurement noise, K = 1/x' for one tap: a reference next to nothing asks for too much."""
-    controller = DiagonalKalman(1, [1.0], state_noise=0.0, measurement_noise=0.0)
+    controller = diagonal_kf(1, [1.0], state_noise=0.0, measurement_noise=0.0)
     for x in (1e-60, 1e-160):  # of the second, even S underflows
         controller.control_signal(x)
         controller.update(1.0)

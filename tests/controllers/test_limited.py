@@ -20,8 +20,8 @@ from kfopc_filterpy import (
     HardClipAmplifier,
     LimitedController,
     OutputLimiter,
+    Plant,
     simulate,
-    simulate_scenarios,
 )
 
 RATED_POWER, WINDOW = 0.05, 80  # of the limiter; the window in samples
@@ -32,9 +32,9 @@ def limiter(rated_power: float = RATED_POWER, **options: Any) -> OutputLimiter:
     return OutputLimiter(rated_power, **{"fs": FS, "window_s": WINDOW / FS} | options)
 
 
-def run(made: Any, *, n: int = N, level: Any = 1.0, **options: Any) -> Any:
+def run(made: Any, *, n: int = N, level: Any = 1.0, plant: Plant | None = None, **options: Any) -> Any:
     x, d, _ = noises(n)
-    return simulate(made, level * x, **{"disturbance": level * d, "secondary_path": S_HAT, "fs": FS} | options)
+    return simulate(made, level * x, plant or Plant(S_HAT, fs=FS), disturbance=level * d, **options)
 
 
 def worst_window(y: np.ndarray, samples: int = WINDOW) -> float:
@@ -55,7 +55,7 @@ def assert_kept(y: np.ndarray, rated_power: float = RATED_POWER) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_what_fits_passes_as_if_there_were_no_limiter(name: str) -> None:
     """Its rated power is a hundred times the control signal's largest window."""
-    options = {"record_weights_every": 1, "record_powers": True}
+    options = {"record_weights_every": 1}
     free = run(MAKERS[name](), **options)
     limited = run(MAKERS[name](limiter=limiter(100.0 * worst_window(free.control_signal))), **options)
     assert_same_run(free, limited)
@@ -76,7 +76,7 @@ def test_no_window_is_above_the_rated_power_for_any_levels(
 ) -> None:
     level = np.repeat(10.0 ** np.array(decades), -(-400 // len(decades)))[:400]
     made = MAKERS[name](limiter=limiter(10.0**rated))
-    result = run(made, n=400, level=level, secondary_path=error_of_the_path * S_HAT)
+    result = run(made, n=400, level=level, plant=Plant(error_of_the_path * S_HAT, fs=FS))
     assert_kept(result.control_signal, 10.0**rated)
 
 
@@ -133,15 +133,6 @@ def test_a_limiter_of_another_rate_is_refused_before_anything_changes() -> None:
         assert pickle.dumps(made) == before
 
 
-def test_scenarios_agree_in_their_limiters_windows() -> None:
-    x, d, _ = noises()
-    two = [MAKERS["KF-ANC"](), MAKERS["KF-OPC"](limiter=limiter())]
-    with pytest.raises(ValueError, match="must agree in the windows of their limiters to share gains"):
-        simulate_scenarios(two, x, disturbance=d, secondary_path=S_HAT, fs=FS)
-    two[1].limiter = None
-    assert len(simulate_scenarios(two, x, disturbance=d, secondary_path=S_HAT, fs=FS)) == 2
-
-
 # ---- A user's own controller
 
 
@@ -179,7 +170,8 @@ class Proportional:
 
 def test_a_users_controller_is_limited_as_the_built_in_is() -> None:
     """FxLMS adapts to the error alone, so it need not be told: to the bit the one with a limiter of its own."""
-    options = {"feedback_path": FEEDBACK, "amplifier": AMPLIFIERS["soft"][0], "switch_on_s": 37 / FS}
+    plant = Plant(S_HAT, feedback=FEEDBACK, amplifier=AMPLIFIERS["soft"][0], fs=FS)
+    options: dict[str, Any] = {"plant": plant, "switch_on_s": 37 / FS}
     limited = LimitedController(Own(), limiter())
     result, built_in = run(limited, **options), run(MAKERS["FxLMS"](limiter=limiter()), **options)
     np.testing.assert_array_equal(result.control_signal, built_in.control_signal)
@@ -216,7 +208,7 @@ def test_refusals_of_a_limited_controller(own: Any, limits: Any, error: type, me
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
 def test_a_copy_is_limited_too(copied: Any) -> None:
-    other = copied(LimitedController(Proportional(), OutputLimiter(1.0, amplitude_limit=2.0)))
+    other = copied(LimitedController(Proportional(), OutputLimiter(1.0, amplitude_limit=2.0, fs=16000)))
     assert isinstance(other, LimitedController)
     assert other.control_signal(1.0) == 2.0
 

@@ -11,12 +11,12 @@ from helpers.channels import random_paths, through
 from helpers.loop import FS, MU, N_TAPS, P0, S_HAT, Q, R, noises
 
 from kfopc_filterpy import (
-    DiagonalKalman,
-    FrequencyDomainFxLMS,
-    FxLMS,
-    FxNLMS,
     KalmanController,
     OutputPowerConstraint,
+    diagonal_kf,
+    frequency_domain_fx_lms,
+    fx_lms,
+    fx_nlms,
     fx_rls,
     kf_anc,
     kf_opc,
@@ -27,21 +27,21 @@ from kfopc_filterpy.paths import PathTolerance, fir_path
 NEW = np.array([0.0, 0.0, -0.7, 0.2])
 KALMAN: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
 MAKERS: dict[str, Any] = {
-    "FxLMS": lambda s: FxLMS(N_TAPS, s, step_size=MU),
-    "FxNLMS": lambda s: FxNLMS(N_TAPS, s, step_size=0.1),
+    "FxLMS": lambda s: fx_lms(N_TAPS, s, step_size=MU),
+    "FxNLMS": lambda s: fx_nlms(N_TAPS, s, step_size=0.1),
     "FxRLS": lambda s: fx_rls(N_TAPS, s, forgetting=0.999),
     "KF-ANC": lambda s: kf_anc(N_TAPS, s, **KALMAN),
     "filterpy": lambda s: KalmanController(KalmanFilter(N_TAPS, 1), s),
-    "diagonal KF": lambda s: DiagonalKalman(N_TAPS, s, **KALMAN),
-    "frequency domain": lambda s: FrequencyDomainFxLMS(N_TAPS, s, step_size=MU, block_size=4, forgetting=None),
+    "diagonal KF": lambda s: diagonal_kf(N_TAPS, s, **KALMAN),
+    "frequency domain": lambda s: frequency_domain_fx_lms(N_TAPS, s, step_size=MU, block_size=4, forgetting=None),
 }
 # 3 microphones, 2 loudspeakers, 2 references
 MANY: dict[str, Any] = {"n_references": 2}
 OLD_PATHS, NEW_PATHS = random_paths(3, 2, 6, seed=1), np.pad(random_paths(3, 2, 5, seed=2), [(0, 0), (0, 0), (0, 1)])
 OF_SEVERAL: dict[str, Any] = {
-    "FxLMS, several": lambda s: FxLMS(N_TAPS, s, step_size=0.1 * MU, **MANY),
+    "FxLMS, several": lambda s: fx_lms(N_TAPS, s, step_size=0.1 * MU, **MANY),
     "KF-ANC, several": lambda s: kf_anc(N_TAPS, s, **KALMAN, **MANY),
-    "diagonal KF, several": lambda s: DiagonalKalman(N_TAPS, s, **KALMAN, **MANY),
+    "diagonal KF, several": lambda s: diagonal_kf(N_TAPS, s, **KALMAN, **MANY),
 }
 GUARDED = [name for name in MAKERS | OF_SEVERAL if name.startswith(("FxLMS", "KF-ANC", "diagonal"))]
 
@@ -76,8 +76,8 @@ def test_it_goes_on_as_if_it_had_always_had_the_new_path(name: str, guarded: boo
         if guarded:
             controller.secondary_path_uncertainty = PathTolerance(delay_samples=0.5)
         controller.listen(x[:100].T, d[:100].T)
-    one.secondary_path = new
-    np.testing.assert_array_equal(one.secondary_path, new)
+    one.secondary = new
+    np.testing.assert_array_equal(one.secondary, new)
     np.testing.assert_allclose(drive(one, 100, 400), drive(other, 100, 400), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(one.weights, other.weights, rtol=1e-9, atol=1e-12)
     assert np.abs(one.weights).max() > 0.001
@@ -86,7 +86,7 @@ def test_it_goes_on_as_if_it_had_always_had_the_new_path(name: str, guarded: boo
 def test_neither_weights_nor_control_signal_jump() -> None:
     one, other = (kf_anc(N_TAPS, S_HAT, **KALMAN) for _ in range(2))
     drive(one, 0, 200), drive(other, 0, 200)
-    one.secondary_path = NEW
+    one.secondary = NEW
     np.testing.assert_array_equal(one.weights, other.weights)
     assert one.control_signal(0.7) == other.control_signal(0.7)
     one.update(0.3), other.update(0.3)
@@ -100,24 +100,24 @@ def covariance_of(controller: Any) -> np.ndarray:
 @pytest.mark.parametrize("name", ["KF-ANC", "filterpy"])
 def test_a_kalman_filter_trusts_its_weights_less(name: str) -> None:
     controller = MAKERS[name](S_HAT)
-    controller.secondary_path = NEW  # no weight can be wrong yet
+    controller.secondary = NEW  # no weight can be wrong yet
     start = covariance_of(controller)
     drive(controller, 0, 200)
     before, w = covariance_of(controller), controller.weights
-    controller.secondary_path = S_HAT
+    controller.secondary = S_HAT
     share = np.sum((NEW - S_HAT) ** 2) / max(NEW @ NEW, S_HAT @ S_HAT)
     expected = before + share * np.mean(w**2) * np.eye(N_TAPS)
     np.testing.assert_allclose(covariance_of(controller), expected, rtol=1e-10, atol=1e-14)
     np.testing.assert_array_equal(start, np.diag(np.diagonal(start)))
-    controller.secondary_path = S_HAT  # the same path tells nothing
+    controller.secondary = S_HAT  # the same path tells nothing
     np.testing.assert_allclose(covariance_of(controller), expected, rtol=1e-10, atol=1e-14)
 
 
 def test_the_diagonal_filter_trusts_its_weights_less() -> None:
-    controller = DiagonalKalman(N_TAPS, S_HAT, **KALMAN)
+    controller = diagonal_kf(N_TAPS, S_HAT, **KALMAN)
     drive(controller, 0, 200)
     before = controller.variances
-    controller.secondary_path = 0.5 * S_HAT  # a quarter of the energy of the change, over that of the larger
+    controller.secondary = 0.5 * S_HAT  # a quarter of the energy of the change, over that of the larger
     np.testing.assert_allclose(controller.variances - before, 0.25 * np.mean(controller.weights**2), rtol=1e-9)
 
 
@@ -128,47 +128,47 @@ def test_the_running_gain_forgets_the_old_path() -> None:
     controller = kf_opc(N_TAPS, S_HAT, constraint=constraint, **KALMAN)
     controller.listen(x[:1000], d[:1000])
     assert controller.secondary_path_gain == pytest.approx(S_HAT @ S_HAT, rel=0.2)
-    controller.secondary_path = 0.5 * S_HAT
+    controller.secondary = 0.5 * S_HAT
     controller.listen(x[1000:], d[1000:])
     assert controller.secondary_path_gain == pytest.approx(0.25 * (S_HAT @ S_HAT), rel=0.2)
 
 
 def test_a_shorter_path_is_filled_with_zeros_and_the_users_array_is_not_touched() -> None:
     given = S_HAT.copy()
-    controller = FxLMS(N_TAPS, given, step_size=MU)
-    controller.secondary_path = [0.0, 0.5]
-    np.testing.assert_array_equal(controller.secondary_path, [0.0, 0.5, 0.0, 0.0])
+    controller = fx_lms(N_TAPS, given, step_size=MU)
+    controller.secondary = [0.0, 0.5]
+    np.testing.assert_array_equal(controller.secondary, [0.0, 0.5, 0.0, 0.0])
     np.testing.assert_array_equal(given, S_HAT)
-    controller.secondary_path = fir_path([0.0, 0.25], FS)
-    np.testing.assert_array_equal(controller.secondary_path, [0.0, 0.25, 0.0, 0.0])
-    controller.secondary_path[1] = 9.0  # a copy
-    assert controller.secondary_path[1] == 0.25
+    controller.secondary = fir_path([0.0, 0.25], FS)
+    np.testing.assert_array_equal(controller.secondary, [0.0, 0.25, 0.0, 0.0])
+    controller.secondary[1] = 9.0  # a copy
+    assert controller.secondary[1] == 0.25
 
 
 @pytest.mark.parametrize(
     ("path", "bad", "message"),
     [
         (S_HAT, np.ones(5), "at most the 4 taps of the present estimate, got 5"),
-        (S_HAT, [0.0, np.nan], "secondary_path"),
-        (S_HAT, [0.0], "secondary_path must not be all zeros"),
+        (S_HAT, [0.0, np.nan], "secondary"),
+        (S_HAT, [0.0], "secondary must not be all zeros"),
         (fir_path(S_HAT, FS), fir_path([0.0, 1.0], 2 * FS), "secondary path is for 16000 Hz"),
         ([[S_HAT]], np.ones((2, 1, 4)), r"\(microphones, loudspeakers\) = \(1, 1\) of the present .* got \(2, 1\)"),
         ([[S_HAT]], np.ones((1, 1, 5)), "at most the 4 taps"),
-        ([[S_HAT]], [[[np.nan, 1.0]]], "secondary_path"),
+        ([[S_HAT]], [[[np.nan, 1.0]]], "secondary"),
     ],
 )
 def test_what_is_refused_changes_nothing(path: Any, bad: Any, message: str) -> None:
-    controller = FxLMS(N_TAPS, path, step_size=MU)
+    controller = fx_lms(N_TAPS, path, step_size=MU)
     with pytest.raises(ValueError, match=message):
-        controller.secondary_path = bad
-    np.testing.assert_array_equal(np.ravel(controller.secondary_path), S_HAT)
+        controller.secondary = bad
+    np.testing.assert_array_equal(np.ravel(controller.secondary), S_HAT)
 
 
 def test_kf_pb_learns_around_the_new_paths() -> None:
     """A path that is assigned before the first sample counts as the one that the controller was made with."""
     budget = {"rated_power": [0.1, 0.2], "averaging_s": 1.0, "fs": FS}
     told, made = (kf_pb(N_TAPS, s, **budget, **MANY) for s in (OLD_PATHS, NEW_PATHS))
-    told.secondary_path = NEW_PATHS
+    told.secondary = NEW_PATHS
     emitted = drive(made, 0, 2000)
     np.testing.assert_allclose(drive(told, 0, 2000), emitted, rtol=1e-9, atol=1e-12)
     assert np.abs(emitted).max() > 0.01

@@ -14,21 +14,22 @@ from helpers.tables import stored_table, write_table
 from scipy.signal import butter, lfilter, sosfilt, unit_impulse
 
 from kfopc_filterpy import (
-    ClippingFxLMS,
-    DiagonalKalman,
-    FxLMS,
-    FxNLMS,
-    LeakyFxLMS,
-    MOVFxLMS,
-    OptimalLeakyFxLMS,
     OutputLimiter,
-    RescalingFxLMS,
-    TwoGradientFxLMS,
+    Plant,
+    clipping_fx_lms,
+    diagonal_kf,
+    fx_lms,
+    fx_nlms,
     kf_anc,
     kf_opc,
     kf_pb,
+    leaky_fx_lms,
+    mov_fx_lms,
     noise_reduction_db,
+    optimal_leaky_fx_lms,
+    rescaling_fx_lms,
     simulate,
+    two_gradient_fx_lms,
 )
 from kfopc_filterpy.verdict.items import aligned
 
@@ -101,16 +102,16 @@ CASES = {
     "KF-OPC, P0/q = 1e12": kalman(kf_opc, 1e12, **RATED),
     "KF-OPC, P0/q = 1e12, limiter": limited,
     "KF-ANC, P0/q = 1e12, 2 x 2": kalman(kf_anc, 1e12, TAPS // 2, TWO),
-    "diagonal KF, P0/q = 1e12": kalman(DiagonalKalman, 1e12),
+    "diagonal KF, P0/q = 1e12": kalman(diagonal_kf, 1e12),
     "KF-PB": partial(kf_pb, TAPS, S, **RATED),
-    "FxLMS": lms(FxLMS),
-    "FxNLMS": lms(FxNLMS),
-    "leaky FxLMS": lms(LeakyFxLMS, leak=0.1),
-    "optimal leaky FxLMS": lms(OptimalLeakyFxLMS, **RATED),
-    "MOV-FxLMS": lms(MOVFxLMS, **RATED),
-    "two-gradient FxLMS": lms(TwoGradientFxLMS, **LIMIT),
-    "re-scaling FxLMS": lms(RescalingFxLMS, **LIMIT),
-    "clipping FxLMS": lms(ClippingFxLMS, **LIMIT),
+    "FxLMS": lms(fx_lms),
+    "FxNLMS": lms(fx_nlms),
+    "leaky FxLMS": lms(leaky_fx_lms, leak=0.1),
+    "optimal leaky FxLMS": lms(optimal_leaky_fx_lms, **RATED),
+    "MOV-FxLMS": lms(mov_fx_lms, **RATED),
+    "two-gradient FxLMS": lms(two_gradient_fx_lms, **LIMIT),
+    "re-scaling FxLMS": lms(rescaling_fx_lms, **LIMIT),
+    "clipping FxLMS": lms(clipping_fx_lms, **LIMIT),
 }
 LOUD = ("clipping FxLMS",)  # its weights grow, so it is loud when the noise changes
 HEAD = ["10,000,000 samples", *(f"{noise}, dB" for noise in NOISES if noise != "silence"), "least/largest of P"]
@@ -123,14 +124,14 @@ def parts(controller, noise, samples):
     """
     rng, size = np.random.default_rng(1), samples // CHECKS
     source, memory = NOISES[noise](rng), np.zeros(PRIMARY.size - 1)
-    secondary = controller.secondary_path
+    secondary = controller.secondary
     rest, under_way = secondary.shape[-1] - 1, 0.0
     for start in range(0, samples, size):
         x = source(start, size)
         d, memory = lfilter(PRIMARY, 1.0, x, zi=memory)
         d = d + SENSOR_NOISE * rng.standard_normal((2, size) if controller.multichannel else size)
         d[..., :rest] -= under_way
-        result = simulate(controller, x, disturbance=d, secondary_path=secondary, fs=FS)
+        result = simulate(controller, x, Plant(secondary, fs=FS), disturbance=d)
         last = np.atleast_2d(result.control_signal)[:, -rest:]
         rings = (
             sum(np.convolve(s, y)[rest:] for s, y in zip(row, last, strict=True))

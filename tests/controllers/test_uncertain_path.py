@@ -10,14 +10,14 @@ import pytest
 from kfopc_filterpy import (
     KFOPC,
     KalmanController,
-    LeakyFxLMS,
     OutputPowerConstraint,
+    Plant,
     kf_anc,
     kf_opc,
     kf_pb,
+    leaky_fx_lms,
     noise_reduction_db,
     simulate,
-    simulate_scenarios,
 )
 from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.paths import PathTolerance
@@ -38,13 +38,13 @@ def test_a_tone_at_which_the_path_is_reversed_is_left_alone(name: str) -> None:
     make: dict[str, Any] = {
         "KF-ANC": lambda: kf_anc(16, estimate, **DIRECT),
         "KF-OPC": lambda: kf_opc(16, estimate, constraint=OutputPowerConstraint(0.5, fs=FS), **DIRECT),
-        "leaky FxLMS": lambda: LeakyFxLMS(16, estimate, step_size=1e-4, leak=1e-3),
+        "leaky FxLMS": lambda: leaky_fx_lms(16, estimate, step_size=1e-4, leak=1e-3),
     }
     changes = []
     for tolerance in (None, PathTolerance(delay_samples=3.0)):
         controller = make[name]()
         controller.secondary_path_uncertainty = tolerance
-        result = simulate(controller, x, primary_path=PRIMARY, secondary_path=TRUE, fs=FS)
+        result = simulate(controller, x, Plant(TRUE, PRIMARY, fs=FS))
         diverged = result.diverged_at_s is not None
         changes.append(np.inf if diverged else -noise_reduction_db(result.error, result.disturbance))
     assert changes[0] > 3.0
@@ -54,7 +54,7 @@ def test_a_tone_at_which_the_path_is_reversed_is_left_alone(name: str) -> None:
 def test_what_takes_no_uncertainty_says_what_does() -> None:
     settings: dict[str, Any] = {"state_noise": 0.0, "measurement_noise": 0.1}
     for controller in (
-        kf_pb(4, TRUE, rated_power=1.0, secondary_path_uncertainty=TOLERANCE),
+        kf_pb(4, TRUE, rated_power=1.0, fs=FS, secondary_path_uncertainty=TOLERANCE),
         KalmanController(KFOPC(dim_x=4, dim_z=1), TRUE),
     ):
         before = controller.secondary_path_uncertainty
@@ -66,7 +66,3 @@ def test_what_takes_no_uncertainty_says_what_does() -> None:
             wrapped.secondary_path_uncertainty = 0.1
     with pytest.raises(ValueError, match="must not be negative"):
         kf_anc(4, TRUE, **settings).secondary_path_uncertainty = -1.0
-    guarded, plain = kf_anc(4, TRUE, **settings), kf_anc(4, TRUE, **settings)
-    guarded.secondary_path_uncertainty = 0.1
-    with pytest.raises(ValueError, match="must agree in their secondary-path uncertainty to share gains"):
-        simulate_scenarios([guarded, plain], np.ones(50), disturbance=np.ones(50), secondary_path=TRUE, fs=FS)

@@ -11,7 +11,7 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from helpers.channels import random_paths, through
 
-from kfopc_filterpy import FxLMS, HardClipAmplifier, kf_pb, noise_reduction_db, simulate
+from kfopc_filterpy import HardClipAmplifier, Plant, fx_lms, kf_pb, noise_reduction_db, simulate
 from kfopc_filterpy.bounds import predictor_reference
 from kfopc_filterpy.controllers import KalmanObserver, VirtualMicrophones, with_internal_model
 from kfopc_filterpy.controllers.base import WrappedController
@@ -37,8 +37,8 @@ def noise(n_samples: int = 1500, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal((1, n_samples))
 
 
-def inner(**options: Any) -> FxLMS:
-    return FxLMS(TAPS, SECONDARY[VIRTUAL], step_size=0.003, **options)
+def inner(**options: Any) -> Any:
+    return fx_lms(TAPS, SECONDARY[VIRTUAL], step_size=0.003, **options)
 
 
 def made(observer: Any = OBSERVATION, controller: Any = None, **options: Any) -> VirtualMicrophones:
@@ -47,7 +47,7 @@ def made(observer: Any = OBSERVATION, controller: Any = None, **options: Any) ->
 
 
 def run(controller: Any, **options: Any) -> Any:
-    return simulate(controller, noise(), primary_path=primary(), secondary_path=SECONDARY, fs=FS, **options)
+    return simulate(controller, noise(), Plant(SECONDARY, primary(), fs=FS), **options)
 
 
 class Recorded:
@@ -74,14 +74,7 @@ def test_with_exact_filters_it_is_the_controller_that_hears_the_virtual_places(k
 
     controller, there = made(controller=one()), one()
     got = run(controller, switch_on_s=switch_on_s)
-    want = simulate(
-        there,
-        noise(),
-        primary_path=primary()[VIRTUAL],
-        secondary_path=SECONDARY[VIRTUAL],
-        fs=FS,
-        switch_on_s=switch_on_s,
-    )
+    want = simulate(there, noise(), Plant(SECONDARY[VIRTUAL], primary()[VIRTUAL], fs=FS), switch_on_s=switch_on_s)
     scale = np.abs(want.control_signal).max()
     np.testing.assert_allclose(got.control_signal, want.control_signal, rtol=0, atol=1e-9 * scale)
     np.testing.assert_allclose(got.error[VIRTUAL], want.error, rtol=0, atol=1e-9)
@@ -112,7 +105,7 @@ def test_with_an_internal_model_the_noise_at_the_virtual_places_is_the_reference
     at_virtual = through(OBSERVATION, d[PHYSICAL])
     x = noise()[:n_references]
     fed_back, forward = (inner(n_references=n_references + len(VIRTUAL)) for _ in range(2))
-    options: Any = {"disturbance": d, "secondary_path": SECONDARY, "fs": FS, "switch_on_s": switch_on_s}
+    options: Any = {"plant": Plant(SECONDARY, fs=FS), "disturbance": d, "switch_on_s": switch_on_s}
     got = simulate(Pausing(made(controller=with_internal_model(fed_back)), ""), x if n_references else None, **options)
     reference = np.concatenate((x, predictor_reference(at_virtual)))
     want = simulate(Pausing(made(controller=forward), ""), reference, **options)
@@ -138,9 +131,7 @@ def test_known_amplifiers_keep_the_estimate_right_when_they_clip() -> None:
     errors = []
     for amplifier in (clip, None):
         controller = made(controller=Recorded(signals), amplifier=amplifier)
-        result = simulate(
-            controller, noise(300), primary_path=primary(), secondary_path=SECONDARY, fs=FS, amplifier=clip
-        )
+        result = simulate(controller, noise(300), Plant(SECONDARY, primary(), amplifier=clip, fs=FS))
         errors.append(np.abs(np.transpose(controller.controller.errors) - result.error[VIRTUAL]).max())
     assert errors[0] < 1e-12 < 0.1 < errors[1]
 
@@ -253,16 +244,16 @@ def test_signals_that_do_not_fit_are_refused_with_nothing_changed(call: Callable
         ({"physical": [0, 1, 2, 3], "virtual": None}, ValueError, "virtual must name a microphone"),
         ({"observer": np.ones((2, 3, 4))}, ValueError, "from the 2 physical to the 2 virtual .* leads from 3 to 2"),
         ({"observer": np.ones((2, 2))}, ValueError, r"filters \(K_v, K_p, n_taps\), got shape \(2, 2\)"),
-        ({"controller": FxLMS(TAPS, SECONDARY, step_size=0.1)}, ValueError, "for the 2 virtual .* n_microphones is 4"),
-        ({"controller": FxLMS(TAPS, SECONDARY[:2, :1], step_size=0.1)}, ValueError, "n_loudspeakers is 1"),
-        ({"controller": FxLMS}, TypeError, "controller must have control_signal"),
+        ({"controller": fx_lms(TAPS, SECONDARY, step_size=0.1)}, ValueError, "for the 2 virtual .* n_microphones is 4"),
+        ({"controller": fx_lms(TAPS, SECONDARY[:2, :1], step_size=0.1)}, ValueError, "n_loudspeakers is 1"),
+        ({"controller": fx_lms}, TypeError, "controller must have control_signal"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )
 def test_settings_that_do_not_fit_are_refused(changed: dict[str, Any], error: type[Exception], message: str) -> None:
     settings = {
         "controller": inner(),
-        "secondary_path": SECONDARY,
+        "secondary": SECONDARY,
         "observer": OBSERVATION,
         "physical": PHYSICAL,
         "virtual": VIRTUAL,
@@ -291,8 +282,8 @@ def test_a_run_at_another_rate_is_refused() -> None:
     inner_one = kf_pb(TAPS, paths[1:], rated_power=1.0, fs=FS)
     controller = VirtualMicrophones(inner_one, paths, [[[1.0]]], physical=[0])
     with pytest.raises(ValueError, match="power memory is for 4000 Hz"):
-        simulate(controller, noise(), disturbance=np.zeros((2, 1500)), secondary_path=paths, fs=2 * FS)
+        simulate(controller, noise(), Plant(paths, fs=2 * FS), disturbance=np.zeros((2, 1500)))
     observer = KalmanObserver(random_model(False)[:2, :2], 1, sensor_noise_std=0.1)
     controller = VirtualMicrophones(Recorded(np.zeros((1, 9))), paths, observer, physical=[0])
     with pytest.raises(ValueError, match="observer is for 4000 Hz"):
-        simulate(controller, noise(), disturbance=np.zeros((2, 1500)), secondary_path=paths, fs=2 * FS)
+        simulate(controller, noise(), Plant(paths, fs=2 * FS), disturbance=np.zeros((2, 1500)))

@@ -17,7 +17,7 @@ import soundfile
 from helpers.core import c_compiler
 from helpers.pages import ROOT
 
-from kfopc_filterpy import HardClipAmplifier, OutputPowerConstraint, kf_anc, kf_opc, kf_pb, simulate
+from kfopc_filterpy import HardClipAmplifier, Plant, fx_nlms, kf_anc, kf_opc, kf_pb, simulate
 from kfopc_filterpy.core.building import FLAGS, FOLDER
 
 sys.path.insert(0, str(ROOT / "docs" / "extensions"))
@@ -94,9 +94,9 @@ def test_the_loop_is_that_of_simulate(name, double):
     noises = {"state_noise": 1e-9, "measurement_noise": 1e-3, "initial_variance": 0.01}
     controller = {
         "plain Kalman filter": lambda: kf_anc(128, secondary, **noises),
-        "KF-OPC": lambda: kf_opc(128, secondary, constraint=OutputPowerConstraint(rated, fs=fs), **noises),
+        "KF-OPC": lambda: kf_opc(128, secondary, rated_power=rated, fs=fs, **noises),
         "KF-PB": lambda: kf_pb(128, secondary, rated_power=rated, fs=fs),
-        "FxNLMS": lambda: listening.FxNLMS(128, secondary, step_size=0.01),
+        "FxNLMS": lambda: fx_nlms(128, secondary, step_size=0.01),
         "off": lambda: None,
     }[name]()
     settings = list(listening.settings_of(controller).values()) if controller else []
@@ -108,7 +108,8 @@ def test_the_loop_is_that_of_simulate(name, double):
         return
     d = double.errors(scene | {"which": 0, "settings": [], "rate": 1.0}, x)
     amplifier = HardClipAmplifier(2 * rated**0.5)
-    expected = simulate(controller, x, disturbance=d, secondary_path=secondary, amplifier=amplifier, fs=fs)
+    plant = Plant(secondary, amplifier=amplifier, fs=fs)
+    expected = simulate(controller, x, plant, disturbance=d)
     assert np.array_equal(played, expected.error)
 
 

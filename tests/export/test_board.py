@@ -15,7 +15,7 @@ import pytest
 from helpers.core import ran
 from helpers.tables import stored_table, write_table
 
-from kfopc_filterpy import DiagonalKalman, FxLMS, OutputLimiter, kf_opc, kf_pb
+from kfopc_filterpy import OutputLimiter, Plant, diagonal_kf, fx_lms, kf_opc, kf_pb
 from kfopc_filterpy.export import export_c
 from kfopc_filterpy.verdict.items import aligned
 
@@ -25,13 +25,14 @@ BOARD = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", 
 MACHINE = (EMULATOR, "-M", "mps2-an386", "-nographic", "-semihosting", "-icount", "shift=0", "-kernel")
 SAMPLES, RATES_HZ = 16_000, (8000, 16000)
 S = np.r_[0.0, 0.8, 0.3, np.zeros(29)]
+PLANT = Plant(S, fs=16000)
 NOISES = {"state_noise": 1e-9, "measurement_noise": 1e-3}
 CONTROLLERS = {
-    "FxLMS, 256 taps": FxLMS(256, S, step_size=1e-4),
-    "diagonal Kalman, 256 taps": DiagonalKalman(256, S, rated_power=0.5, **NOISES),
-    "KF-OPC, 64 taps": kf_opc(64, S, rated_power=0.5, **NOISES),
-    "KF-OPC, 64 taps, limiter": kf_opc(64, S, rated_power=0.5, limiter=OutputLimiter(0.5), **NOISES),
-    "KF-PB, 64 taps": kf_pb(64, S, rated_power=0.5),
+    "FxLMS, 256 taps": fx_lms(256, PLANT, step_size=1e-4),
+    "diagonal Kalman, 256 taps": diagonal_kf(256, PLANT, rated_power=0.5, **NOISES),
+    "KF-OPC, 64 taps": kf_opc(64, PLANT, rated_power=0.5, **NOISES),
+    "KF-OPC, 64 taps, limiter": kf_opc(64, PLANT, rated_power=0.5, limiter=OutputLimiter(0.5, fs=16000), **NOISES),
+    "KF-PB, 64 taps": kf_pb(64, PLANT, rated_power=0.5),
 }
 MILLIONS = (f"at {rate // 1000} kHz" for rate in RATES_HZ)
 HEAD = ["Cortex-M4, single precision", "flash", "data", "stack", "mean", "worst", *MILLIONS]

@@ -18,69 +18,72 @@ from helpers.core import ran as succeeds
 
 from kfopc_filterpy import (
     KFOPC,
-    ClippingFxLMS,
-    DiagonalKalman,
-    FxLMS,
-    FxNLMS,
     HardClipAmplifier,
     KalmanController,
-    LeakyFxLMS,
-    MOVFxLMS,
-    OptimalLeakyFxLMS,
     OutputLimiter,
     OutputPowerConstraint,
-    RescalingFxLMS,
+    Plant,
     SoftSaturationAmplifier,
-    TwoGradientFxLMS,
+    clipping_fx_lms,
+    diagonal_kf,
+    fx_lms,
+    fx_nlms,
     fx_rls,
     kf_anc,
     kf_opc,
     kf_pb,
+    leaky_fx_lms,
+    mov_fx_lms,
+    optimal_leaky_fx_lms,
+    rescaling_fx_lms,
     simulate,
+    two_gradient_fx_lms,
 )
-from kfopc_filterpy.controllers import FeedbackNeutralizer, with_internal_model
+from kfopc_filterpy.controllers import CoreController, FeedbackNeutralizer, with_internal_model
 from kfopc_filterpy.core.building import core_sources
 from kfopc_filterpy.export import Float32Controller, export_c
 
-L, RATED, WINDOW = 16, 0.5, 800
+FS, L, RATED, WINDOW = 16000, 16, 0.5, 800
 TRAINING, SAMPLES = 3_000, 5_000
-S_HAT = np.array([0.0, 0.85, -0.35, 0.25, 0.1])
 S = np.array([0.0, 0.9, -0.4, 0.2, 0.1, 0.05])
 S_TWO = random_paths(2, 2, 6, seed=1)
-S_TWO_HAT = S_TWO[..., :5] + 0.02 * random_paths(2, 2, 5, seed=2)
 P_TWO = random_paths(2, 2, 30, seed=3, delay=8)
+ONE, TWO = Plant(S, fs=FS), Plant(S_TWO, fs=FS)
+# What the controllers take them for.
+ONE_HAT = Plant([0.0, 0.85, -0.35, 0.25, 0.1], fs=FS)
+TWO_HAT = Plant(S_TWO[..., :5] + 0.02 * random_paths(2, 2, 5, seed=2), fs=FS)
 
 NOISES = {"state_noise": 1e-7, "measurement_noise": 1e-2}
 ALGORITHMS = {
-    "FxLMS": (FxLMS, {"step_size": 2e-4}),
-    "FxNLMS": (FxNLMS, {"step_size": 0.005}),
-    "leaky": (LeakyFxLMS, {"step_size": 2e-4, "leak": 0.3}),
-    "optimal leaky": (OptimalLeakyFxLMS, {"step_size": 2e-4, "rated_power": RATED}),
-    "MOV": (MOVFxLMS, {"step_size": 2e-4, "rated_power": RATED}),
-    "MOV modified": (MOVFxLMS, {"step_size": 2e-4, "rated_power": RATED, "modified": True}),
-    "MOV fixed": (MOVFxLMS, {"step_size": 2e-4, "rated_power": RATED, "penalty_factor": 0.3}),
-    "two-gradient": (TwoGradientFxLMS, {"step_size": 2e-4, "amplitude_limit": 0.8, "output_step_size": 1e-4}),
-    "clipping": (ClippingFxLMS, {"step_size": 2e-4, "amplitude_limit": 0.8}),
-    "rescaling": (RescalingFxLMS, {"step_size": 2e-4, "amplitude_limit": 0.8}),
+    "FxLMS": (fx_lms, {"step_size": 2e-4}),
+    "FxNLMS": (fx_nlms, {"step_size": 0.005}),
+    "leaky": (leaky_fx_lms, {"step_size": 2e-4, "leak": 0.3}),
+    "optimal leaky": (optimal_leaky_fx_lms, {"step_size": 2e-4, "rated_power": RATED}),
+    "MOV": (mov_fx_lms, {"step_size": 2e-4, "rated_power": RATED}),
+    "MOV modified": (mov_fx_lms, {"step_size": 2e-4, "rated_power": RATED, "modified": True}),
+    "MOV fixed": (mov_fx_lms, {"step_size": 2e-4, "penalty_factor": 0.3}),
+    "two-gradient": (two_gradient_fx_lms, {"step_size": 2e-4, "amplitude_limit": 0.8, "output_step_size": 1e-4}),
+    "clipping": (clipping_fx_lms, {"step_size": 2e-4, "amplitude_limit": 0.8}),
+    "rescaling": (rescaling_fx_lms, {"step_size": 2e-4, "amplitude_limit": 0.8}),
     "KF-ANC": (kf_anc, NOISES),
     "KF-OPC": (kf_opc, {"rated_power": RATED, **NOISES}),
     "FxRLS": (fx_rls, {"forgetting": 0.999}),
-    "diagonal": (DiagonalKalman, {"rated_power": RATED, **NOISES}),
+    "diagonal": (diagonal_kf, {"rated_power": RATED, **NOISES}),
 }
 ONE_CHANNEL = {"FxRLS"}
 
 
 def limiter(rated_power=RATED, window=WINDOW):
-    return OutputLimiter(rated_power, window_s=window / 16000)
+    return OutputLimiter(rated_power, fs=FS, window_s=window / FS)
 
 
 def constraint(rated_power=RATED):
-    return OutputPowerConstraint(rated_power, window="sliding", memory_s=0.01)
+    return OutputPowerConstraint(rated_power, fs=FS, window="sliding", memory_s=0.01)
 
 
 def made(name, **more):
     kind, settings = ALGORITHMS[name]
-    return kind(L, S_HAT, **settings, **more)
+    return kind(L, ONE_HAT, **settings, **more)
 
 
 def with_everything(name, taps=L):
@@ -99,7 +102,7 @@ def with_everything(name, taps=L):
     if two:
         settings["n_references"] = 2
     limiters = [limiter(), limiter(0.3)] if two else limiter()
-    controller = kind(taps, S_TWO_HAT if two else S_HAT, limiter=limiters, **settings)
+    controller = kind(taps, TWO_HAT if two else ONE_HAT, limiter=limiters, **settings)
     if controller.takes_guard:
         controller.secondary_path_uncertainty = 0.2
     return controller
@@ -111,16 +114,16 @@ CONTROLLERS = {f"{name}, everything": lambda name=name: with_everything(name) fo
     "MOV": lambda: made("MOV"),
     "KF-OPC": lambda: made("KF-OPC"),
     "KF-OPC, limited": lambda: made("KF-OPC", limiter=limiter()),
-    "KF-OPC, one tap": lambda: kf_opc(1, [0.9], rated_power=RATED, **NOISES),
+    "KF-OPC, one tap": lambda: kf_opc(1, [0.9], rated_power=RATED, fs=FS, **NOISES),
     "KF-OPC, large initial variance": lambda: kf_opc(
-        L, S_HAT, rated_power=RATED, state_noise=1e-6, measurement_noise=1e-6, initial_variance=100.0
+        L, ONE_HAT, rated_power=RATED, state_noise=1e-6, measurement_noise=1e-6, initial_variance=100.0
     ),
-    "KF-PB": lambda: short_blocks(L, S_HAT, rated_power=RATED, fs=16000.0),
+    "KF-PB": lambda: short_blocks(L, ONE_HAT, rated_power=RATED, fs=FS),
     "KF-PB, everything": lambda: short_blocks(
-        L, S_TWO_HAT, rated_power=[RATED, 0.3], fs=16000.0, n_references=2, limiter=[limiter(), limiter(0.3)]
+        L, TWO_HAT, rated_power=[RATED, 0.3], fs=FS, n_references=2, limiter=[limiter(), limiter(0.3)]
     ),
     "hybrid KF-OPC": lambda: with_internal_model(
-        kf_opc(L, S_TWO_HAT, rated_power=RATED, n_references=3, limiter=[limiter(), limiter(0.3)], **NOISES)
+        kf_opc(L, TWO_HAT, rated_power=RATED, n_references=3, limiter=[limiter(), limiter(0.3)], **NOISES)
     ),
 }
 
@@ -137,11 +140,8 @@ def noises(n=TRAINING + SAMPLES):
 
 def ran(controller, part, n=TRAINING + SAMPLES, dtype="float64"):
     x, d = (signal[:, part] for signal in noises(n))
-    path = S_TWO
-    if not controller.multichannel:
-        x, d, path = x[0], d[0], S
-    runs = controller if dtype == "float64" else Float32Controller(controller)
-    result = simulate(runs, x[: controller.n_references] if x.ndim > 1 else x, disturbance=d, secondary_path=path)
+    x, d, plant = (x[: controller.n_references], d, TWO) if controller.multichannel else (x[0], d[0], ONE)
+    result = simulate(controller if dtype == "float64" else Float32Controller(controller), x, plant, disturbance=d)
     assert result.diverged_at_s is None
     return result
 
@@ -209,7 +209,7 @@ def test_the_bits_are_those_of_python(name, dtype, tmp_path):
 @pytest.mark.parametrize("several", [False, True])
 def test_a_feedback_controller_has_no_reference_argument(several, dtype, tmp_path):
     """The example runs the self-test first, which compares with the bits of Python."""
-    path, n_references = (S_TWO_HAT, 2) if several else (S_HAT, 1)
+    path, n_references = (TWO_HAT, 2) if several else (ONE_HAT, 1)
     controller = with_internal_model(kf_opc(L, path, rated_power=RATED, n_references=n_references, **NOISES))
     errors = 0.1 * noises()[1][: 1 + several, :200]
     controller.process(None, errors if several else errors[0])
@@ -301,15 +301,15 @@ def test_an_export_changes_nothing_in_the_controller(tmp_path):
 
 
 def test_what_float32_cannot_hold_is_refused(tmp_path):
-    long = FxLMS(2, [1.0], step_size=0.1, limiter=limiter(window=100_000))
+    long = fx_lms(2, [1.0], step_size=0.1, limiter=limiter(window=100_000))
     with pytest.raises(ValueError, match=r"window of 100000 samples is too long for float32.*at most"):
         export_c(long, tmp_path / "anc.c", dtype="float32")
     with pytest.raises(ValueError, match="path must be finite in float32"):
-        export_c(FxLMS(2, [1e39], step_size=0.1), tmp_path / "anc.c", dtype="float32")
+        export_c(fx_lms(2, [1e39], step_size=0.1), tmp_path / "anc.c", dtype="float32")
     with pytest.raises(ValueError, match="initial_variance must be finite in float32"):
         export_c(kf_anc(2, [1.0], initial_variance=1e39, **NOISES), tmp_path / "anc.c", dtype="float32")
     with pytest.raises(ValueError, match="a setting or a path of diagonal is out of its range"):
-        export_c(DiagonalKalman(2, [1.0], initial_variance=1e30, **NOISES), tmp_path / "anc.c", dtype="float32")
+        export_c(diagonal_kf(2, [1.0], initial_variance=1e30, **NOISES), tmp_path / "anc.c", dtype="float32")
     assert list(tmp_path.iterdir()) == []
     assert export_c(long, tmp_path / "anc.c").n_bytes > 3 * 8 * 100_000
 
@@ -321,7 +321,7 @@ def test_a_large_initial_variance_is_no_harm_in_float32(ratio, tmp_path):
     It is harm from 10^8 on, where float64 starts 30 times as loud as with 10^4, too.
     """
     noise = {"state_noise": 1e-8, "measurement_noise": 1e-3, "initial_variance": 1e-3 * ratio}
-    controller = kf_opc(L, S_HAT, rated_power=RATED, **noise)
+    controller = kf_opc(L, ONE_HAT, rated_power=RATED, **noise)
     program = Program(controller, tmp_path, "float32", path=S)
     x, d = (signal[0] for signal in noises())
     out = program.run(x, d)
@@ -504,12 +504,12 @@ def test_the_readme_states_how_many_multiplications_a_sample_takes(name, everyth
     """LLVM compiles for a machine that counts them: within 3 %, or 5 of them, because small terms are left out."""
     clang, n, taps = compiler("clang"), 100, 64
     if name == "KF-PB":
-        controller = kf_pb(taps, S_HAT, rated_power=RATED, limiter=limiter() if everything else None)
+        controller = kf_pb(taps, ONE_HAT, rated_power=RATED, limiter=limiter() if everything else None)
     elif everything:
         controller = with_everything(name, taps)
     else:
         kind, settings = ALGORITHMS[name]
-        controller = kind(taps, S_HAT, **settings)
+        controller = kind(taps, ONE_HAT, **settings)
     if name != "KF-PB":  # which states only what it does between its blocks, here from its first sample
         ran(controller, slice(TRAINING))
     program = Program(controller, tmp_path)
@@ -585,7 +585,7 @@ def test_a_name_cannot_end_the_comment_that_it_stands_in(tmp_path):
 # What is refused.
 
 
-class Own(FxLMS):
+class Own(CoreController):
     """An FxLMS with calls of its own."""
 
     def update(self, error):
@@ -595,9 +595,12 @@ class Own(FxLMS):
 NOT_EXPORTED = {
     "a number": (lambda: 3.0, "float .* is not in the core"),
     "wrapper": (lambda: FeedbackNeutralizer(made("KF-OPC"), [0.0, 0.1]), r"FeedbackNeutralizer\) is not in the core"),
-    "own calls": (lambda: Own(4, S_HAT, step_size=0.1), r"FxLMS \(Own\) has calls of its own"),
+    "own calls": (
+        lambda: Own("FxLMS", "fxlms", 4, ONE_HAT, settings={"step_size": 0.1}),
+        r"FxLMS \(Own\) has calls of its own",
+    ),
     "estimator": (
-        lambda: KalmanController(KFOPC.random_walk(4, rated_power=RATED, **NOISES), S_HAT),
+        lambda: KalmanController(KFOPC.random_walk(4, rated_power=RATED, **NOISES), ONE_HAT),
         r"KF-OPC \(KalmanController\) has calls of its own",
     ),
 }

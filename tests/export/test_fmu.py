@@ -13,7 +13,7 @@ from helpers.c99 import WARNINGS
 from helpers.channels import random_paths
 from helpers.core import compiler, ran, tool, zig
 
-from kfopc_filterpy import FxLMS, OutputLimiter, OutputPowerConstraint, kf_opc, kf_pb, simulate
+from kfopc_filterpy import OutputLimiter, OutputPowerConstraint, Plant, fx_lms, kf_opc, kf_pb, simulate
 from kfopc_filterpy.export import Float32Controller, export_fmu
 
 fmpy = pytest.importorskip("fmpy", reason="needs FMPy (the extra `fmu`)")
@@ -22,15 +22,15 @@ for part in ("fmpy.fmi3", "fmpy.validation"):
 pytest.importorskip("ziglang", reason="zig compiles for both systems")
 pytestmark = pytest.mark.slow  # zig compiles for two systems
 FS, SAMPLES = 8000, 2000
-PATH = np.array([0.0, 0.8, 0.3, -0.1])
-PATHS, PRIMARY = random_paths(2, 2, 4, seed=1), random_paths(2, 2, 12, seed=2, delay=4)
+ONE = Plant([0.0, 0.8, 0.3, -0.1], [0, 0, 0, 0, 1.0], fs=FS)
+TWO = Plant(random_paths(2, 2, 4, seed=1), random_paths(2, 2, 12, seed=2, delay=4), fs=FS)
 NOISES = {"state_noise": 1e-7, "measurement_noise": 1e-2}
 CONTROLLERS = {
-    "FxLMS": lambda: FxLMS(16, PATH, step_size=1e-3),
+    "FxLMS": lambda: fx_lms(16, ONE, step_size=1e-3),
     "KF-OPC": lambda: kf_opc(
-        16, PATH, constraint=OutputPowerConstraint(0.3, fs=FS), limiter=OutputLimiter(0.3, fs=FS), **NOISES
+        16, ONE, constraint=OutputPowerConstraint(0.3, fs=FS), limiter=OutputLimiter(0.3, fs=FS), **NOISES
     ),
-    "KF-PB": lambda: kf_pb(8, PATHS, rated_power=[0.3, 0.2], n_references=2, fs=FS),
+    "KF-PB": lambda: kf_pb(8, TWO, rated_power=[0.3, 0.2], n_references=2),
 }
 
 
@@ -110,8 +110,7 @@ def opened(units):
 
 def run(controller, several=False, samples=SAMPLES):
     x = np.random.default_rng(0).standard_normal((2, samples))
-    paths = {"primary_path": PRIMARY, "secondary_path": PATHS} if several else {"primary_path": [0, 0, 0, 0, 1.0]}
-    return simulate(controller, x if several else x[0], **{"secondary_path": PATH} | paths, fs=FS)
+    return simulate(controller, x, TWO) if several else simulate(controller, x[0], ONE)
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])

@@ -183,7 +183,7 @@ def test_settings_that_do_not_fit_are_refused() -> None:
         with pytest.raises(TypeError):
             KFOPC(4, rated_power=bad)
     with pytest.raises(TypeError, match="constraint must be an OutputPowerConstraint or None"):
-        KFOPC(4, constraint=[OutputPowerConstraint(1.0), 2.0])
+        KFOPC(4, constraint=[OutputPowerConstraint(1.0, fs=8000), 2.0])
     fast = KFOPC.random_walk(4, state_noise=0.0, measurement_noise=1.0)
     with pytest.raises(TypeError, match=r"this filter has one loudspeaker, .* not a sequence of 2"):
         fast.rated_power = [1.0, 2.0]

@@ -31,7 +31,7 @@ def make(kind: str, rated_power: float | None = None, **settings: Any) -> KFOPC:
     """A filter; `settings` are those of its constraint."""
     own: dict[str, Any] = {"rated_power": rated_power}
     if settings:
-        own = {"constraint": OutputPowerConstraint(rated_power or 1.0, **settings)}
+        own = {"constraint": OutputPowerConstraint(rated_power or 1.0, **{"fs": 16000} | settings)}
     if kind == "random walk":
         kf: KFOPC = KFOPC.random_walk(TAPS, state_noise=STATE_NOISE, measurement_noise=NOISE, **own)
     else:
@@ -176,7 +176,7 @@ def test_a_constraint_that_is_none_or_one_too_many_is_refused(kind: str) -> None
     noises = {"state_noise": 0.0, "measurement_noise": 1.0} if kind == "random walk" else {}
     made: Any = KFOPC.random_walk if kind == "random walk" else KFOPC
     with pytest.raises(ValueError, match=r"give either rated_power= or constraint=.*, not both"):
-        made(3, rated_power=1.0, constraint=OutputPowerConstraint(1.0), **noises)
+        made(3, rated_power=1.0, constraint=OutputPowerConstraint(1.0, fs=8000), **noises)
     with pytest.raises(TypeError, match=r"constraint must be an OutputPowerConstraint or None, got 1\.0"):
         made(3, constraint=1.0, **noises)
     kf = make(kind)

@@ -18,7 +18,7 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).res
 from oracles import power_budget as law  # noqa: E402
 
 from comparisons.studies import kf_pb_cases as study  # noqa: E402
-from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S  # noqa: E402
+from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S  # noqa: E402
 from kfopc_filterpy.metrics import overshoot  # noqa: E402
 
 CASES = (
@@ -84,8 +84,8 @@ def without(rule: str) -> Iterator[dict[str, float]]:
 
 def main() -> None:
     """Print a line for each rule."""
-    pairs, made = study.all_paths(), study.noises()
-    cases = [study.make_rated(pairs[path], made[noise][1](), study.SHARES[0]) for path, noise in CASES]
+    plants, made = study.all_plants(), study.noises()
+    cases = [study.make_rated(plants[path], made[noise][1](), study.SHARES[0]) for path, noise in CASES]
     rules = (
         "nothing",
         "hold",

@@ -12,31 +12,30 @@ from helpers.channels import random_paths
 from helpers.loop import AMPLIFIERS, FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R
 from kfopc_filterpy import (
     KFOPC,
-    ClippingFxLMS,
-    DiagonalKalman,
-    FrequencyDomainFxLMS,
-    FxLMS,
-    FxNLMS,
     HardClipAmplifier,
     KalmanController,
-    LeakyFxLMS,
     LimitedController,
-    MOVFxLMS,
-    OptimalLeakyFxLMS,
     OutputLimiter,
     OutputPowerConstraint,
-    RescalingFxLMS,
-    TwoGradientFxLMS,
+    clipping_fx_lms,
+    diagonal_kf,
+    frequency_domain_fx_lms,
+    fx_lms,
+    fx_nlms,
     fx_rls,
     kf_anc,
     kf_opc,
     kf_pb,
+    leaky_fx_lms,
+    mov_fx_lms,
+    optimal_leaky_fx_lms,
+    rescaling_fx_lms,
+    two_gradient_fx_lms,
 )
 from kfopc_filterpy.controllers import (
     FeedbackNeutralizer,
     KalmanObserver,
     VirtualMicrophones,
-    posterior,
 )
 from kfopc_filterpy.paths import PathTolerance
 
@@ -49,7 +48,7 @@ def constraint(**settings: Any) -> OutputPowerConstraint:
 
 def short_blocks(taps: int, path: Any, **settings: Any) -> Any:
     """Return KF-PB with blocks of 16 samples, of which a short run has many, and an averaging time of 20 blocks."""
-    with mock.patch.object(posterior, "BLOCK_S", 16 / FS):
+    with mock.patch("kfopc_filterpy.controllers.kf_pb.BLOCK_S", 16 / FS):
         return kf_pb(taps, path, **{"fs": FS, "averaging_s": 320 / FS} | settings)
 
 
@@ -59,17 +58,17 @@ MAKERS: dict[str, Any] = {
     "KF-OPC, sliding": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(window="sliding"), **KALMAN, **o),
     "KF-PB": lambda **o: short_blocks(N_TAPS, S_HAT, rated_power=0.3, **o),
     "fxRLS": lambda **o: fx_rls(N_TAPS, S_HAT, forgetting=0.999, **o),
-    "diagonal KF": lambda **o: DiagonalKalman(N_TAPS, S_HAT, **KALMAN, **o),
-    "diagonal KF-OPC": lambda **o: DiagonalKalman(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
-    "FxLMS": lambda **o: FxLMS(N_TAPS, S_HAT, step_size=MU, **o),
-    "FxNLMS": lambda **o: FxNLMS(N_TAPS, S_HAT, step_size=0.1, **o),
-    "leaky": lambda **o: LeakyFxLMS(N_TAPS, S_HAT, step_size=MU, leak=0.3, **o),
-    "optimal leaky": lambda **o: OptimalLeakyFxLMS(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), **o),
-    "MOV": lambda **o: MOVFxLMS(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), **o),
-    "MOV, modified": lambda **o: MOVFxLMS(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), modified=True, **o),
-    "two-gradient": lambda **o: TwoGradientFxLMS(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
-    "re-scaling": lambda **o: RescalingFxLMS(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
-    "clipping": lambda **o: ClippingFxLMS(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
+    "diagonal KF": lambda **o: diagonal_kf(N_TAPS, S_HAT, **KALMAN, **o),
+    "diagonal KF-OPC": lambda **o: diagonal_kf(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
+    "FxLMS": lambda **o: fx_lms(N_TAPS, S_HAT, step_size=MU, **o),
+    "FxNLMS": lambda **o: fx_nlms(N_TAPS, S_HAT, step_size=0.1, **o),
+    "leaky": lambda **o: leaky_fx_lms(N_TAPS, S_HAT, step_size=MU, leak=0.3, **o),
+    "optimal leaky": lambda **o: optimal_leaky_fx_lms(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), **o),
+    "MOV": lambda **o: mov_fx_lms(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), **o),
+    "MOV, modified": lambda **o: mov_fx_lms(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), modified=True, **o),
+    "two-gradient": lambda **o: two_gradient_fx_lms(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
+    "re-scaling": lambda **o: rescaling_fx_lms(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
+    "clipping": lambda **o: clipping_fx_lms(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
 }
 KNOWS_AN_AMPLIFIER = [
     name
@@ -115,26 +114,26 @@ SEVERAL: dict[str, Any] = {
     "kf_pb, exact path": lambda: short_blocks(
         L, PATHS, rated_power=0.05, secondary_path_uncertainty=None, limiter=limiters(), **MANY
     ),
-    "DiagonalKalman": lambda: DiagonalKalman(L, PATHS, constraint=constraints(), limiter=limiters(), **KALMAN, **MANY),
-    "FxLMS": lambda: FxLMS(L, PATHS, step_size=MU, limiter=limiters(), **MANY),
-    "FxNLMS": lambda: FxNLMS(L, PATHS, step_size=0.1, **MANY),
-    "LeakyFxLMS": lambda: LeakyFxLMS(L, PATHS, step_size=MU, leak=[0.3, 0.1], **MANY),
-    "OptimalLeakyFxLMS": lambda: OptimalLeakyFxLMS(L, PATHS, step_size=MU, constraint=constraints(), **MANY),
-    "MOVFxLMS": lambda: MOVFxLMS(L, PATHS, step_size=MU, constraint=constraints(), modified=True, **MANY),
-    "TwoGradientFxLMS": lambda: TwoGradientFxLMS(L, PATHS, step_size=MU, amplitude_limit=0.5, **MANY),
-    "RescalingFxLMS": lambda: RescalingFxLMS(L, PATHS, step_size=MU, amplitude_limit=[0.1, 0.5], **MANY),
-    "ClippingFxLMS": lambda: ClippingFxLMS(L, PATHS, step_size=MU, amplitude_limit=0.5, **MANY),
+    "DiagonalKalman": lambda: diagonal_kf(L, PATHS, constraint=constraints(), limiter=limiters(), **KALMAN, **MANY),
+    "FxLMS": lambda: fx_lms(L, PATHS, step_size=MU, limiter=limiters(), **MANY),
+    "FxNLMS": lambda: fx_nlms(L, PATHS, step_size=0.1, **MANY),
+    "LeakyFxLMS": lambda: leaky_fx_lms(L, PATHS, step_size=MU, leak=[0.3, 0.1], **MANY),
+    "OptimalLeakyFxLMS": lambda: optimal_leaky_fx_lms(L, PATHS, step_size=MU, constraint=constraints(), **MANY),
+    "MOVFxLMS": lambda: mov_fx_lms(L, PATHS, step_size=MU, constraint=constraints(), modified=True, **MANY),
+    "TwoGradientFxLMS": lambda: two_gradient_fx_lms(L, PATHS, step_size=MU, amplitude_limit=0.5, **MANY),
+    "RescalingFxLMS": lambda: rescaling_fx_lms(L, PATHS, step_size=MU, amplitude_limit=[0.1, 0.5], **MANY),
+    "ClippingFxLMS": lambda: clipping_fx_lms(L, PATHS, step_size=MU, amplitude_limit=0.5, **MANY),
 }
 
 # Controllers that adapt once per block. Runs of 300 samples end within one.
 
 IN_BLOCKS: dict[str, Any] = {
-    "frequency domain": lambda: FrequencyDomainFxLMS(N_TAPS, S_HAT, step_size=0.2, block_size=7),
-    "block LMS": lambda: FrequencyDomainFxLMS(N_TAPS, S_HAT, step_size=MU, block_size=14, forgetting=None),
-    "unconstrained": lambda: FrequencyDomainFxLMS(
+    "frequency domain": lambda: frequency_domain_fx_lms(N_TAPS, S_HAT, step_size=0.2, block_size=7),
+    "block LMS": lambda: frequency_domain_fx_lms(N_TAPS, S_HAT, step_size=MU, block_size=14, forgetting=None),
+    "unconstrained": lambda: frequency_domain_fx_lms(
         56, S_HAT, step_size=0.1, block_size=7, partition_size=28, constrained=False
     ),
-    "frequency domain, many": lambda: FrequencyDomainFxLMS(
+    "frequency domain, many": lambda: frequency_domain_fx_lms(
         L, PATHS, step_size=0.1, block_size=7, partition_size=14, **MANY
     ),
 }
@@ -157,7 +156,7 @@ class OwnController:
     def __init__(self) -> None:
         self.weights, self.x = np.zeros(6), [0.0] * 8
         self.count, self.emissions = 0, []
-        self.secondary_path = np.array([0.0, 1.0])
+        self.secondary = np.array([0.0, 1.0])
 
     def control_signal(self, reference: float) -> float:
         self.x = [reference, *self.x[:-1]]
@@ -220,17 +219,16 @@ AROUND: dict[str, Any] = {
     "fading memory": lambda: KalmanController(_faded(KFOPC.random_walk(N_TAPS, **KALMAN)), S_HAT, name="faded"),
     "KF-PB, exact path": lambda: short_blocks(N_TAPS, S_HAT, rated_power=0.3, secondary_path_uncertainty=None),
     "guarded KF-OPC": lambda: _guarded(kf_opc(N_TAPS, S_HAT, constraint=constraint(), **KALMAN)),
-    "guarded FxLMS": lambda: _guarded(FxLMS(N_TAPS, S_HAT, step_size=MU)),
-    "guarded FxLMS, many": lambda: _guarded(FxLMS(L, PATHS, step_size=MU, **MANY)),
+    "guarded FxLMS": lambda: _guarded(fx_lms(N_TAPS, S_HAT, step_size=MU)),
+    "guarded FxLMS, many": lambda: _guarded(fx_lms(L, PATHS, step_size=MU, **MANY)),
     "guarded KF-ANC, many": lambda: _guarded(kf_anc(L, PATHS, **KALMAN, **MANY)),
     "LimitedController": lambda: LimitedController(OwnController(), OutputLimiter(0.02, fs=FS, window_s=0.01)),
     "FeedbackNeutralizer": lambda: FeedbackNeutralizer(MAKERS["FxLMS"](), [0.0, 0.1, 0.05]),
-    "FeedbackNeutralizer, a user's": lambda: FeedbackNeutralizer(OwnController(), [0.0, 0.1, 0.05]),
     "FeedbackNeutralizer, many": lambda: FeedbackNeutralizer(
         SEVERAL["kf_anc"](), random_paths(I, J, 3, seed=4), amplifier=HardClipAmplifier(0.7)
     ),
     "VirtualMicrophones": lambda: VirtualMicrophones(
-        FxLMS(L, PATHS[2:], step_size=MU, **MANY), PATHS, random_paths(1, 2, 3, seed=5), physical=[0, 1]
+        fx_lms(L, PATHS[2:], step_size=MU, **MANY), PATHS, random_paths(1, 2, 3, seed=5), physical=[0, 1]
     ),
     "VirtualMicrophones, KalmanObserver": lambda: VirtualMicrophones(
         kf_anc(L, PATHS[2:], **KALMAN, **MANY), PATHS, _observer(), physical=[0, 1]

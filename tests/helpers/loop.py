@@ -3,7 +3,7 @@
 import numpy as np
 from oracles import signals
 
-from kfopc_filterpy import HardClipAmplifier, LinearAmplifier, SoftSaturationAmplifier, simulate
+from kfopc_filterpy import HardClipAmplifier, LinearAmplifier, Plant, SoftSaturationAmplifier, simulate
 
 N_TAPS, N = 10, 500
 S = np.array([0.0, 0.9, -0.4, 0.2, 0.1])
@@ -30,16 +30,6 @@ def noises(n=N, seed=3):
 def run(made, *, amplifier=None, feedback=None, on=0, n=N, **options):
     """Run a controller in the scene, everything recorded."""
     x, d, _ = noises(n)
-    options = {"fs": FS, "record_weights_every": 1, "record_powers": True} | options
-    return simulate(
-        made,
-        x,
-        disturbance=d,
-        secondary_path=S,
-        feedback_path=feedback,
-        amplifier=amplifier,
-        sensor_noise_std=0.05,
-        rng=11,
-        switch_on_s=on / FS,
-        **options,
-    )
+    plant = Plant(S, feedback=feedback, amplifier=amplifier, fs=FS, sensor_noise_std=0.05)
+    options = {"record_weights_every": 1} | options
+    return simulate(made, x, plant, disturbance=d, rng=11, switch_on_s=on / FS, **options)

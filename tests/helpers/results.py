@@ -1,4 +1,4 @@
-"""Results with several channels, made by hand: no controller has several yet."""
+"""Results made by hand, with one channel and with several."""
 
 import numpy as np
 

@@ -10,23 +10,20 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from comparisons.bench.measured import DataUnavailableError, load_measured_duct
 from kfopc_filterpy import (
+    Plant,
     bandpass_path,
     kf_anc,
     kf_opc,
-    noise_reduction_db,
-    nse_db,
-    output_power,
-    simulate_scenarios,
+    simulate,
     suggest_settings,
 )
 from kfopc_filterpy.bounds import SuggestedSettings, wiener_solution
-from kfopc_filterpy.paths import duct_paths, path_taps
+from kfopc_filterpy.paths import duct_plant
 from kfopc_filterpy.signals import (
     band_limited_noise,
     bursty_noise,
@@ -80,25 +77,26 @@ NOISES: dict[str, Noise] = {
 }
 
 
-def made_paths() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return primary and secondary taps of the models, by name."""
-    duct = duct_paths(fs=FS)
-    return {
-        "band-pass": (path_taps(bandpass_path(128)), path_taps(bandpass_path(32))),
-        "duct": (path_taps(duct.primary), path_taps(duct.secondary)),
-    }
+def made_plants() -> dict[str, Plant]:
+    """Return the plants of the models, by name."""
+    return {"band-pass": Plant(bandpass_path(32, fs=FS), bandpass_path(128, fs=FS)), "duct": duct_plant(fs=FS)}
 
 
-def signals(primary: np.ndarray, noise: Noise, seed: int, duration: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return reference, disturbance and standard deviation of the microphone's noise."""
+def noisy_scene(plant: Plant, noise: Noise, seed: int, duration: float) -> tuple[np.ndarray, Plant]:
+    """Return a reference of power 1, and the plant with the noise of its microphone."""
     x = scaled_to_power(noise(duration + ON / FS, seed), 1.0)
-    d = np.convolve(x, primary)[: x.size]
-    return x, d, SENSOR_NOISE * float(np.sqrt(np.mean(d**2)))
+    std = SENSOR_NOISE * float(np.sqrt(np.mean(plant.disturbance(x) ** 2)))
+    return x, Plant(plant.secondary, plant.primary, fs=FS, sensor_noise_std=std)
+
+
+def silent_run(x: np.ndarray, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """Return the reference and what the microphone hears of it, without the start-up."""
+    d = plant.disturbance(x)[ON:]
+    return x[ON:], d + plant.sensor_noise_std * np.random.default_rng(5).standard_normal(d.size)
 
 
 def compare(
-    primary: np.ndarray,
-    s: np.ndarray,
+    plant: Plant,
     noise: Noise,
     *,
     duration: float,
@@ -111,33 +109,26 @@ def compare(
     with which KF-OPC exceeds the rated power, and the power with the suggested ones, by 2 % is not counted: while the
     level changes, weights that lag behind the factor reduce more noise, with power that they should not take.
     """
-    x, d, std = signals(primary, noise, 1, duration)
-    silent = x[ON:], d[ON:] + std * np.random.default_rng(5).standard_normal(d.size - ON)
-    suggested = suggest_settings(*silent, s, fs=FS, max_taps=max(lengths))
+    heard, d = silent_run(*noisy_scene(plant, noise, 1, duration))
+    suggested = suggest_settings(heard, plant, disturbance=d, max_taps=max(lengths))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", np.exceptions.RankWarning)
-        fixed = wiener_solution(*silent, s, suggested.n_taps, regularization=1e-6)
-    x, d, std = signals(primary, noise, 2, duration)
-    options: dict[str, Any] = {"disturbance": d, "secondary_path": s, "fs": FS, "switch_on_s": ON / FS}
-
+        fixed = wiener_solution(heard, plant, n_taps=suggested.n_taps, disturbance=d, regularization=1e-6)
     rated = RATED_SHARE * fixed.control_power
+    x, noisy = noisy_scene(plant, noise, 2, duration)
 
-    def run(n_taps: int, settings: dict[str, float]) -> tuple[np.ndarray, float]:
-        free = kf_anc(n_taps, s, **settings)
-        constrained = kf_opc(n_taps, s, rated_power=rated, **settings)
-        results = simulate_scenarios([free, constrained], x, sensor_noise_std=std, rng=[6, 6], **options)
-        merits = [
-            (noise_reduction_db(r.error, r.disturbance), -float(np.mean(nse_db(r.error, r.disturbance, FS, 0.05))))
-            for r in results
-        ]
-        return np.array(merits), output_power(results[1].control_signal)
+    def run(n_taps: int, noises: dict[str, float]) -> tuple[np.ndarray, float]:
+        both = kf_anc(n_taps, plant, **noises), kf_opc(n_taps, plant, rated_power=rated, **noises)
+        results = simulate(both, x, noisy, rng=6, switch_on_s=ON / FS)
+        merits = [(one.noise_reduction_db, -float(np.mean(one.nse_db(0.05)))) for one in results]
+        return np.array(merits), results[1].output_power
 
-    own, power = run(suggested.n_taps, suggested.settings)
+    own, power = run(suggested.n_taps, suggested.noises)
     best = np.full((2, 2), -np.inf)
     for n_taps in lengths:
-        at = suggest_settings(*silent, s, fs=FS, n_taps=n_taps)
+        at = suggest_settings(heard, plant, disturbance=d, n_taps=n_taps)
         for factor in factors:
-            merits, used = run(n_taps, dataclasses.replace(at, state_noise=factor * at.state_noise).settings)
+            merits, used = run(n_taps, dataclasses.replace(at, state_noise=factor * at.state_noise).noises)
             best[0] = np.maximum(best[0], merits[0])
             if used <= 1.02 * max(power, rated):
                 best[1] = np.maximum(best[1], merits[1])
@@ -146,7 +137,9 @@ def compare(
 
 def main() -> None:
     """Print the table of all cases."""
-    paths, noises = made_paths(), dict(NOISES)
+    from comparisons.bench.measured import DataUnavailableError, load_measured_duct
+
+    plants, noises = made_plants(), dict(NOISES)
     try:
         for name, apart_s in (("motor", 5.0), ("compressor", 8.0)):  # the run begins so much later in the recording
             measured = load_measured_duct(name)
@@ -155,15 +148,15 @@ def main() -> None:
                 recording, duration, fs=FS, start_s=apart_s * (seed - 1)
             )
         scale = np.sqrt(np.sum(measured.secondary**2))  # its units are arbitrary
-        paths["measured duct"] = measured.primary / scale, measured.secondary / scale
+        plants["measured duct"] = Plant(measured.secondary / scale, measured.primary / scale, fs=FS)
     except DataUnavailableError as error:
         print(f"without the measured duct and the recordings: {error}")
     print("dB by which the best of the grid is better: noise reduction, mean NSE")
     worst = np.zeros((2, 2))
-    for path, (primary, s) in paths.items():
+    for path, plant in plants.items():
         for name, noise in noises.items():
             found = compare(
-                primary, s, noise, duration=4.5, lengths=(32, 64, 128, 256), factors=(0.01, 0.1, 1.0, 10.0, 100.0)
+                plant, noise, duration=4.5, lengths=(32, 64, 128, 256), factors=(0.01, 0.1, 1.0, 10.0, 100.0)
             )
             loss = found.best - found.own
             worst = np.maximum(worst, loss)

@@ -12,7 +12,7 @@ import pytest
 from comparisons.bench import Runs, Scene, StudyReport, make_controller
 from comparisons.bench.registry import REGISTRY
 from comparisons.studies import cases
-from kfopc_filterpy import SimulationResult, simulate
+from kfopc_filterpy import Plant, SimulationResult, simulate
 
 
 @contextmanager
@@ -49,14 +49,17 @@ def run_study(study: Any) -> StudyReport:
     return report
 
 
-def plain_run(scene: Scene, algorithm: str, setting: Any, *, known: Any = None, **options: Any) -> SimulationResult:
+def plain_run(
+    scene: Scene, algorithm: str, setting: Any, *, amplifier: Any = None, known: Any = None, **options: Any
+) -> SimulationResult:
     """Run a scene's first seed as a user would; `known` is an amplifier that the controller knows."""
-    made = make_controller(scene, algorithm, setting, amplifier=known)
-    plant = {"disturbance": scene.disturbances[0], "secondary_path": scene.secondary, "fs": scene.fs}
-    noise = {"sensor_noise_std": scene.sensor_noise_std, "rng": 1000 + scene.seeds[0]}
-    return simulate(made, scene.references[0], switch_on_s=scene.switch_on_s, **plant, **noise, **options)
+    controller = make_controller(scene, algorithm, setting, amplifier=known)
+    plant = Plant(scene.secondary, amplifier=amplifier, fs=scene.fs, sensor_noise_std=scene.sensor_noise_std)
+    run = {"disturbance": scene.disturbances[0], "switch_on_s": scene.switch_on_s, "rng": 1000 + scene.seeds[0]}
+    return simulate(controller, scene.references[0], plant, **run, **options)
 
 
-def short_duct() -> dict[str, cases.Pair]:
-    """Return the paths of the modelled duct, cut short."""
-    return {"duct": tuple(path[:200] for path in cases.modelled_paths()["duct"])}
+def short_duct() -> dict[str, Plant]:
+    """Return the modelled duct, its paths cut short."""
+    duct = cases.modelled_plants()["duct"]
+    return {"duct": Plant(duct.secondary[..., :200], duct.primary[..., :200], fs=duct.fs)}

@@ -5,18 +5,20 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from helpers.comparing import SIGNALS, assert_same_run
 from helpers.loop import FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R, S, noises, run
+from helpers.simulation import Stepwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kfopc_filterpy import (
     KFOPC,
-    FxLMS,
     HardClipAmplifier,
     KalmanController,
-    MOVFxLMS,
     OutputPowerConstraint,
+    Plant,
+    fx_lms,
     kf_anc,
     kf_opc,
+    mov_fx_lms,
     simulate,
 )
 from kfopc_filterpy.loop.simulation import STRETCH
@@ -30,8 +32,8 @@ def controller(name, *, rated_power=0.3):
     if name == "KF-OPC":
         return kf_opc(N_TAPS, S_HAT, constraint=constraint, **kalman)
     if name == "FxLMS":
-        return FxLMS(N_TAPS, S_HAT, step_size=MU)
-    return MOVFxLMS(N_TAPS, S_HAT, step_size=MU, constraint=constraint)
+        return fx_lms(N_TAPS, S_HAT, step_size=MU)
+    return mov_fx_lms(N_TAPS, S_HAT, step_size=MU, constraint=constraint)
 
 
 @pytest.mark.parametrize(("own", "rated_power"), [("filterpy", None), ("KFOPC", None), ("KFOPC", 0.3)])
@@ -61,7 +63,7 @@ def test_pieces_of_the_compiled_loop_do_not_show(name):
     n, done = 2 * STRETCH + 7, []
     whole = run(controller(name), n=n, progress=done.append)
     assert done == [STRETCH, STRETCH, 7]
-    assert_same_run(whole, run(controller(name), n=n, compiled=False))
+    assert_same_run(whole, run(Stepwise(controller(name)), n=n))
 
 
 # ---- What must hold for any signal
@@ -79,10 +81,9 @@ def test_scaled_noise_and_rated_power_scale_the_control(name, exponent, seed):
         if name == "KF-OPC":
             made = kf_opc(N_TAPS, S_HAT, constraint=constraint, state_noise=R, measurement_noise=Q * c**2)
         else:
-            made = MOVFxLMS(N_TAPS, S_HAT, step_size=MU / c**2, constraint=constraint)
-        plant = {"disturbance": c * d, "secondary_path": S, "amplifier": HardClipAmplifier(0.7 * c)}
-        noise = {"sensor_noise_std": 0.05 * c, "rng": 5}
-        return simulate(made, c * x, fs=FS, record_weights_every=10, **plant, **noise)
+            made = mov_fx_lms(N_TAPS, S_HAT, step_size=MU / c**2, constraint=constraint)
+        plant = Plant(S, amplifier=HardClipAmplifier(0.7 * c), fs=FS, sensor_noise_std=0.05 * c)
+        return simulate(made, c * x, plant, disturbance=c * d, rng=5, record_weights_every=10)
 
     one, scaled = at_scale(1.0), at_scale(2.0**exponent)
     for signal, factor in (("control_signal", 2.0**exponent), ("error", 2.0**exponent), ("weights", 1.0)):
@@ -94,11 +95,9 @@ def test_scaled_noise_and_rated_power_scale_the_control(name, exponent, seed):
 @settings(max_examples=25)
 def test_with_rated_power_to_spare_the_constrained_are_the_unconstrained(seed, rated_power):
     x, d, _ = noises(200, seed)
-    for constrained, free in (("KF-OPC", "KF-ANC"), ("MOV-FxLMS", "FxLMS")):
-        one, other = (
-            simulate(controller(name, rated_power=rated_power), x, disturbance=d, secondary_path=S, fs=FS)
-            for name in (constrained, free)
-        )
+    plant = Plant(S, fs=FS)
+    for names in (("KF-OPC", "KF-ANC"), ("MOV-FxLMS", "FxLMS")):
+        one, other = (simulate(controller(name, rated_power=rated_power), x, plant, disturbance=d) for name in names)
         np.testing.assert_array_equal(one.constraint_factor, 1.0)
         np.testing.assert_array_equal(one.control_signal, other.control_signal)
         np.testing.assert_array_equal(one.error, other.error)

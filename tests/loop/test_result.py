@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from helpers.results import multichannel_result, single_result
 
+from kfopc_filterpy import metrics
+
 
 @pytest.mark.parametrize("make", [single_result, multichannel_result])
 def test_samples_and_times_are_those_of_the_last_axis(make):
@@ -26,6 +28,15 @@ def test_a_result_is_frozen_and_its_arrays_are_read_only():
     np.testing.assert_array_equal(copied.error, result.error)
     assert result == result
     assert result != copied  # arrays have no single truth value: results are compared by their fields
+
+
+@pytest.mark.parametrize("make", [single_result, multichannel_result])
+def test_figures_of_merit_are_those_of_its_signals(make):
+    run = make(4000)
+    assert run.noise_reduction_db == metrics.noise_reduction_db(run.error, run.disturbance)
+    np.testing.assert_array_equal(run.output_power, metrics.output_power(run.control_signal))
+    np.testing.assert_array_equal(run.nse_db(0.01), metrics.nse_db(run.error, run.disturbance, run.fs, 0.01))
+    assert run.convergence_time_s() == metrics.convergence_time_s(run.error, run.disturbance, run.fs)
 
 
 def test_a_result_says_what_came_out():

@@ -6,12 +6,14 @@ import pytest
 import scipy.signal
 from helpers.channels import delayed
 
+from kfopc_filterpy import HardClipAmplifier, Plant
 from kfopc_filterpy.paths import estimate_path, identify_secondary_path
 from kfopc_filterpy.paths.path_matrix import path_matrix
 
 FS = 8000.0
 N_TAPS = 12
 PATHS = np.random.default_rng(11).standard_normal((3, 2, N_TAPS)) * 0.8 ** np.arange(N_TAPS)
+PLANT = Plant(PATHS, fs=FS)
 
 
 def recordings(n=600, noise=0.05, seed=0):
@@ -68,33 +70,29 @@ def test_one_loudspeaker_and_several_microphones_or_the_other_way_round():
 
 @pytest.mark.parametrize("loudspeakers", ["in turn", "at once"])
 def test_noiseless_identification_is_exact(loudspeakers):
-    settings = {"n_taps": N_TAPS, "duration_s": 0.5, "rng": 0, "fs": FS, "loudspeakers": loudspeakers}
-    exact = identify_secondary_path(PATHS, **settings, regularization=0.0)
+    settings = {"n_taps": N_TAPS, "duration_s": 0.5, "rng": 0, "loudspeakers": loudspeakers}
+    exact = identify_secondary_path(PLANT, **settings, regularization=0.0)
     assert exact.misalignment_db.shape == (3, 2)
     assert np.all(exact.misalignment_db < -250)
     assert exact.modelling_error_db.shape == (3, 2, exact.frequencies_hz.size)
     assert np.all(exact.modelling_error_db < -200)
-    np.testing.assert_allclose(identify_secondary_path(PATHS, **settings).misalignment_db, -100, atol=3)
+    np.testing.assert_allclose(identify_secondary_path(PLANT, **settings).misalignment_db, -100, atol=3)
 
 
 def test_a_sweep_identifies_in_turn():
-    settings = {"n_taps": N_TAPS, "duration_s": 0.5, "rng": 0, "fs": FS, "excitation": "sweep"}
-    assert np.all(identify_secondary_path(PATHS, **settings, regularization=0.0).misalignment_db < -150)
+    settings = {"n_taps": N_TAPS, "duration_s": 0.5, "rng": 0, "excitation": "sweep"}
+    assert np.all(identify_secondary_path(PLANT, **settings, regularization=0.0).misalignment_db < -150)
     with pytest.raises(ValueError, match="loudspeakers must be 'in turn' for a sweep"):
-        identify_secondary_path(PATHS, **settings, loudspeakers="at once")
+        identify_secondary_path(PLANT, **settings, loudspeakers="at once")
 
 
 @pytest.mark.parametrize("loudspeakers", ["in turn", "at once"])
 def test_noise_gives_the_error_of_least_squares(loudspeakers):
     # Variance of each tap: noise power / (samples * excitation power), however many loudspeakers play.
     noise, level, n_samples = 0.3, 2.0, 4000
-    results = [
-        identify_secondary_path(
-            PATHS, fs=FS, n_taps=N_TAPS, duration_s=n_samples / FS, rng=seed, level=level, sensor_noise_std=noise,
-            loudspeakers=loudspeakers,
-        )
-        for seed in range(20)
-    ]  # fmt: skip
+    plant = Plant(PATHS, fs=FS, sensor_noise_std=noise)
+    settings = {"n_taps": N_TAPS, "duration_s": n_samples / FS, "level": level, "loudspeakers": loudspeakers}
+    results = [identify_secondary_path(plant, **settings, rng=seed) for seed in range(20)]
     error = np.mean([10 ** (result.misalignment_db / 10) for result in results], axis=0) * np.sum(PATHS**2, axis=2)
     # 20 runs of 12 taps in 6 pairs: a standard deviation of 4 % in the mean, 9 % in a pair.
     expected = N_TAPS * noise**2 / (n_samples * level**2)
@@ -107,29 +105,26 @@ def test_noise_gives_the_error_of_least_squares(loudspeakers):
 
 
 def test_each_loudspeaker_has_its_amplifier():
-    settings = {"n_taps": N_TAPS, "duration_s": 1.0, "rng": 0, "fs": FS}
+    settings = {"n_taps": N_TAPS, "duration_s": 1.0, "rng": 0}
 
-    def clip(u):
-        return np.clip(u, -1.0, 1.0, out=u)  # in place: the excitation must not suffer
-
-    result = identify_secondary_path(PATHS, **settings, amplifier=[None, clip], loudspeakers="at once")
+    clip = HardClipAmplifier(1.0)
+    result = identify_secondary_path(Plant(PATHS, amplifier=[None, clip], fs=FS), **settings, loudspeakers="at once")
     gains = np.sum(result.taps * PATHS, axis=2) / np.sum(PATHS**2, axis=2)
     np.testing.assert_allclose(gains[:, 0], 1.0, atol=0.05)
     np.testing.assert_allclose(gains[:, 1], 0.682689, atol=0.05)  # Bussgang: erf(1/sqrt(2))
-    both = identify_secondary_path(PATHS, **settings, amplifier=clip)
+    both, of_a_sample = (
+        identify_secondary_path(Plant(PATHS, amplifier=amplifier, fs=FS), **settings)
+        for amplifier in (clip, lambda y: max(-1.0, min(y, 1.0)))
+    )
     np.testing.assert_allclose(np.sum(both.taps * PATHS, axis=2) / np.sum(PATHS**2, axis=2), 0.682689, atol=0.02)
-    for wrong in ([clip], [1.0, 2.0], 3.0):
-        with pytest.raises(TypeError, match="amplifier must be a function of a signal, or one for each of the 2"):
-            identify_secondary_path(PATHS, **settings, amplifier=wrong)
+    np.testing.assert_array_equal(of_a_sample.taps, both.taps)
 
 
 @pytest.mark.parametrize("loudspeakers", ["in turn", "at once"])
-def test_a_matrix_of_one_path_gives_what_the_path_gives(loudspeakers):
-    settings = {"n_taps": 20, "duration_s": 0.3, "rng": 5, "fs": FS, "sensor_noise_std": 0.1}
-    alone = identify_secondary_path(PATHS[0, 0], **settings)
-    matrix = identify_secondary_path(PATHS[:1, :1], **settings, loudspeakers=loudspeakers)
-    for name in ("taps", "modelling_error_db", "misalignment_db"):
-        np.testing.assert_array_equal(getattr(matrix, name)[0, 0], getattr(alone, name))
+def test_one_path_has_no_axes_of_channels(loudspeakers):
+    plant = Plant(PATHS[0, 0], fs=FS, sensor_noise_std=0.1)
+    alone = identify_secondary_path(plant, n_taps=20, duration_s=0.3, rng=5, loudspeakers=loudspeakers)
+    assert alone.taps.shape == (20,)
     assert (type(alone.estimate), alone.estimate.dt) == (control.TransferFunction, 1 / FS)
     assert {type(alone.misalignment_db), type(alone.residual_db)} == {float}
 
@@ -158,13 +153,12 @@ def test_estimate_refuses(sent, heard, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fs": None}, "fs must be given if secondary_path is a tap array"),
+        ({"plant": PLANT.changed_at(1.0, secondary=-PATHS)}, "needs a plant that does not change"),
         ({"duration_s": 0.004, "loudspeakers": "at once"}, "duration_s must be at least 0.00438 s for 12 taps"),
-        ({"secondary_path": PATHS * np.array([1.0, 0.0])[:, None]},
-         r"secondary_path\[0\]\[1\] must not be all zeros.*unplugged"),
+        ({"plant": Plant(PATHS * [[1.0], [0.0]], fs=FS)}, "secondary path 0, 1 must not be all zeros.*unplugged"),
     ],
-)  # fmt: skip
+)
 def test_identification_refuses(changes, message):
-    settings = {"secondary_path": PATHS, "n_taps": N_TAPS, "duration_s": 0.1, "rng": 0, "fs": FS, **changes}
+    settings = {"plant": PLANT, "n_taps": N_TAPS, "duration_s": 0.1, "rng": 0} | changes
     with pytest.raises(ValueError, match=message):
-        identify_secondary_path(settings.pop("secondary_path"), **settings)
+        identify_secondary_path(**settings)

@@ -9,17 +9,27 @@ import control
 import numpy as np
 import pytest
 
-from kfopc_filterpy import FxLMS, simulate
+from kfopc_filterpy import Plant, fx_lms, simulate
 from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.paths import feedback_margin, fir_path, internal_model_margin
 
 FS = 8000.0
+DELAY = np.array([0.0, 1.0])
+
+
+def heard(path: Any) -> Plant:
+    """Return a plant with an acoustic feedback path; its secondary path does not matter."""
+    return Plant(path[:1] if np.ndim(path) == 3 else path, feedback=path, fs=FS)
+
+
+def played(path: Any) -> Plant:
+    return Plant(path, fs=FS)
 
 
 @pytest.mark.parametrize("gain", [0.5, -0.8, 0.05])
 def test_one_tap_in_closed_form(gain: float) -> None:
     """1 / (1 - g z^-1): (1 + L)^-1 - 1/2 = (1 + g z^-1) / (1 - g z^-1) / 2, largest where g z^-1 = |g|."""
-    margin = feedback_margin([gain], [0.0, 1.0], fs=FS)
+    margin = feedback_margin([gain], heard(DELAY))
     g = abs(gain)
     disk = 2 * (1 - g) / (1 + g)
     assert margin.stable
@@ -36,7 +46,7 @@ def test_one_tap_in_closed_form(gain: float) -> None:
 def test_margins_are_the_least_over_all_frequencies() -> None:
     rng = np.random.default_rng(0)
     w, f = 0.2 * rng.standard_normal(12), np.concatenate(([0.0], 0.3 * rng.standard_normal(9)))
-    margin = feedback_margin(w, f, fs=FS)
+    margin = feedback_margin(w, heard(f))
     omega = np.linspace(0.0, np.pi * FS, 16385)
     disk, gain_db, phase_deg = control.disk_margins(margin.loop, omega)
     assert margin.disk_margin == pytest.approx(disk, rel=1e-3)
@@ -53,16 +63,16 @@ def test_stability_is_that_of_the_poles() -> None:
         taps = -np.convolve(w, left)
         taps[0] += 1.0
         stable = bool(np.abs(np.roots(taps)).max() < 1.0)
-        assert feedback_margin(w, left, fs=FS).stable == stable
+        assert feedback_margin(w, heard(left)).stable == stable
         outcomes.add(stable)
     assert outcomes == {True, False}
 
 
 def test_an_estimate_widens_the_margin() -> None:
-    w, f = [0.5, 0.3], fir_path([0.0, 0.8, 0.4], FS)
-    alone = feedback_margin(w, f)
-    neutralised = feedback_margin(w, f, [0.0, 0.7, 0.4, 0.01])
-    exact = feedback_margin(w, f, f)
+    w, plant = [0.5, 0.3], heard([0.0, 0.8, 0.4])
+    alone = feedback_margin(w, plant)
+    neutralised = feedback_margin(w, plant, [0.0, 0.7, 0.4, 0.01])
+    exact = feedback_margin(w, plant, plant.feedback)
     assert 0.0 <= alone.disk_margin < neutralised.disk_margin < exact.disk_margin == pytest.approx(2.0)
     left = np.array([0.0, 0.1, 0.0, -0.01])
     np.testing.assert_allclose(neutralised.loop(1j), -np.polyval(np.convolve(w, left)[::-1], 1 / 1j), atol=1e-12)
@@ -74,15 +84,15 @@ def test_an_estimate_widens_the_margin() -> None:
 @pytest.mark.parametrize("gain", [0.5, -0.8])
 def test_one_tap_behind_an_internal_model_in_closed_form(gain: float) -> None:
     """T = g z^-2 with s^ = z^-1: a path (1 + delta) z^-1 gives 1 + g delta z^-2 = 0, on the circle at |delta| = 1/|g|."""
-    margin = internal_model_margin([gain], [0.0, 1.0], fs=FS)
+    margin = internal_model_margin([gain], played(DELAY))
     assert margin.path_error == pytest.approx(1 / abs(gain), rel=1e-12)
     np.testing.assert_allclose(margin.path_error_at([0.0, 1000.0, FS / 2]), 1 / abs(gain), rtol=1e-12)
     # 1/|1/2 - T| is the disk margin: the least where T = -|g|
     assert margin.disk_margin == pytest.approx(1 / (0.5 + abs(gain)), rel=1e-6)
     for error in (0.99, 1.01):
-        wrong = [0.0, 1 + error / abs(gain)]
-        assert internal_model_margin([gain], wrong, [0.0, 1.0], fs=FS).stable == (error < 1)
-    silent = internal_model_margin([0.0], [0.0, 1.0], fs=FS)
+        wrong = played((1 + error / abs(gain)) * DELAY)
+        assert internal_model_margin([gain], wrong, DELAY).stable == (error < 1)
+    silent = internal_model_margin([0.0], played(DELAY))
     assert (silent.path_error, silent.disk_margin) == (np.inf, pytest.approx(2.0))
 
 
@@ -93,7 +103,7 @@ def test_the_margins_are_those_of_python_control_and_the_poles() -> None:
         w, s = rng.standard_normal(6), np.concatenate(([0.0], rng.standard_normal(4)))
         w *= rng.uniform(0.1, 1.0)
         estimate = s + 0.5 * rng.standard_normal(5)
-        margin = internal_model_margin(w, s, estimate, fs=FS)
+        margin = internal_model_margin(w, played(s), estimate)
         closed = np.convolve(np.append(0.0, w), s - estimate)  # 1 + z^-1 W (S - S^)
         closed[0] += 1.0
         stable = bool(np.abs(np.roots(closed)).max() < 1.0)
@@ -115,12 +125,12 @@ def test_a_settled_controller_is_unstable_where_its_margin_ends(gains: Any) -> N
     """The gain of the path grows until the margin says unstable; just below, a run of the frozen controller dies away."""
     gains = np.array(gains)
     s = np.stack((np.zeros_like(gains), gains), axis=-1)
-    controller = with_internal_model(FxLMS(8, s, step_size=0.01, n_references=len(np.atleast_1d(gains))))
+    controller = with_internal_model(fx_lms(8, s, step_size=0.01, n_references=len(np.atleast_1d(gains))))
     d = np.sin(0.3 * np.arange(4000)) + 0.3 * np.random.default_rng(0).standard_normal((*gains.shape[:1], 4000))
-    simulate(controller, None, disturbance=d, secondary_path=s)
+    simulate(controller, None, played(s), disturbance=d)
 
     def stable(gain: float) -> bool:
-        return internal_model_margin(controller.control_filter, gain * s, s, fs=FS).stable
+        return internal_model_margin(controller.control_filter, played(gain * s), s).stable
 
     inside, outside = 1.0, 20.0
     assert stable(inside)
@@ -128,7 +138,7 @@ def test_a_settled_controller_is_unstable_where_its_margin_ends(gains: Any) -> N
     while outside - inside > 0.01:
         middle = (inside + outside) / 2
         inside, outside = (middle, outside) if stable(middle) else (inside, middle)
-    assert outside - 1.0 >= internal_model_margin(controller.control_filter, s, fs=FS).path_error
+    assert outside - 1.0 >= internal_model_margin(controller.control_filter, played(s)).path_error
     for gain, dies in ((0.97 * inside, True), (1.03 * outside, False)):
         frozen, loudest, y = deepcopy(controller), [], np.zeros(gains.shape[:1])
         for n in range(2000):
@@ -158,11 +168,10 @@ def test_loops_side_by_side_have_the_lesser_margin_and_turned_microphones_do_not
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     for _ in range(12):
         loops = random_loop(rng), random_loop(rng)
-        alone = [internal_model_margin(*loop, fs=FS) for loop in loops]
-        w, s, estimate = (side_by_side(*both) for both in zip(*loops, strict=True))
-        margin = internal_model_margin(
-            np.einsum("jct,kc->jkt", w, turn), *(np.einsum("kc,cjt->kjt", turn, path) for path in (s, estimate)), fs=FS
-        )
+        alone = [internal_model_margin(w, played(s), estimate) for w, s, estimate in loops]
+        w, *paths = (side_by_side(*both) for both in zip(*loops, strict=True))
+        s, estimate = (np.einsum("kc,cjt->kjt", turn, path) for path in paths)
+        margin = internal_model_margin(np.einsum("jct,kc->jkt", w, turn), played(s), estimate)
         outcomes.add(margin.stable)
         assert margin.stable == all(one.stable for one in alone)
         for name in ("disk_margin", "path_error", "gain_margin_db", "phase_margin_deg"):
@@ -185,7 +194,7 @@ def test_stability_of_several_channels_is_that_of_the_poles() -> None:
             left[i][i][0] += 1.0
         determinant = np.convolve(left[0][0], left[1][1]) - np.convolve(left[0][1], left[1][0])
         stable = bool(np.abs(np.roots(determinant)).max() < 1.0)
-        assert feedback_margin(w, f, fs=FS).stable == stable
+        assert feedback_margin(w, heard(f)).stable == stable
         outcomes.add(stable)
     assert outcomes == {True, False}
 
@@ -201,40 +210,47 @@ def test_the_tolerated_error_is_the_least_that_makes_the_loop_unstable(
     w[..., 1], s[..., 1] = rng.standard_normal(w.shape[:2]), rng.standard_normal(s.shape[:2])
     constant = s[..., 1] @ w[..., 1] if side == "microphones" else w[..., 1] @ s[..., 1]
     left, values, right = np.linalg.svd(constant)
-    margin = internal_model_margin(w, s, fs=FS)
+    margin = internal_model_margin(w, played(s))
     other = w[..., 1] @ s[..., 1] if side == "microphones" else s[..., 1] @ w[..., 1]
     assert margin.path_error == pytest.approx(1 / max(values[0], np.linalg.norm(other, 2)), rel=1e-9)
     for share in (0.99, 1.01):
         factor = np.eye(len(constant)) + share / values[0] * np.outer(right[0], left[:, 0])
         wrong = np.einsum("kc,cjt->kjt", factor, s) if side == "microphones" else np.einsum("kct,cj->kjt", s, factor)
-        assert internal_model_margin(w, wrong, s, fs=FS).stable == (share < 1)
+        assert internal_model_margin(w, played(wrong), s).stable == (share < 1)
 
 
 def test_of_a_hybrid_filter_the_rows_of_the_disturbances_count() -> None:
     w, s, estimate = random_loop(np.random.default_rng(5))
     rows = np.stack((np.ones_like(w), w))[np.newaxis]
-    assert internal_model_margin(rows, s, estimate, fs=FS) == internal_model_margin(w, s, estimate, fs=FS)
+    assert internal_model_margin(rows, played(s), estimate) == internal_model_margin(w, played(s), estimate)
 
 
 def test_the_words() -> None:
-    assert repr(feedback_margin([2.0], [0.0, 1.0], fs=FS)) == "<FeedbackMargin: unstable>"
-    assert "least at 0 Hz" in repr(feedback_margin([0.5], [0.0, 1.0], fs=FS))
+    assert repr(feedback_margin([2.0], heard(DELAY))) == "<FeedbackMargin: unstable>"
+    assert "least at 0 Hz" in repr(feedback_margin([0.5], heard(DELAY)))
 
 
-def test_what_is_refused() -> None:
-    with pytest.raises(ValueError, match="delay of at least one sample"):
-        feedback_margin([1.0], [0.5, 1.0], fs=FS)
-    with pytest.raises(ValueError, match=r"control_filter must be \(2 loudspeakers, 1 microphones"):
-        internal_model_margin(np.ones(4), np.ones((1, 2, 4)), fs=FS)
-    with pytest.raises(ValueError, match="channels of the path"):
-        internal_model_margin([1.0], [0.0, 1.0], np.ones((2, 1, 4)), fs=FS)
-    with pytest.raises(ValueError, match="loop is that of one channel"):
-        _ = internal_model_margin(np.zeros((2, 1, 4)), np.ones((1, 2, 4)), fs=FS).loop
-    with pytest.raises(ValueError, match="secondary_estimate"):
-        internal_model_margin([1.0], [0.0, 1.0], fir_path([0.0, 1.0], 2 * FS), fs=FS)
-    with pytest.raises(ValueError, match="control_filter must be"):
-        feedback_margin(np.ones((1, 2, 4)), [0.0, 1.0], fs=FS)
-    with pytest.raises(ValueError, match="fs"):
-        feedback_margin([1.0], [0.0, 1.0])
-    with pytest.raises(ValueError, match="feedback_estimate"):
-        feedback_margin([1.0], [0.0, 1.0], fir_path([0.0, 1.0], 2 * FS), fs=FS)
+OTHER_RATE = fir_path(DELAY, 2 * FS)
+REFUSED: list[tuple[Any, str]] = [
+    (lambda: feedback_margin([1.0], Plant([1.0], fs=FS)), "plant must have a feedback path"),
+    (lambda: feedback_margin([1.0], heard(DELAY), [0.5, 1.0]), "estimate must have a delay of at least one sample"),
+    (lambda: feedback_margin([1.0], heard(DELAY), OTHER_RATE), "estimate is sampled at 16000 Hz but fs is 8000 Hz"),
+    (lambda: feedback_margin(np.ones((1, 2, 4)), heard(DELAY)), r"control_filter must be \(1 loudspeakers, 1 microph"),
+    (
+        lambda: feedback_margin([1.0], heard(DELAY).changed_at(1.0, feedback=-DELAY)),
+        "needs a plant that does not change",
+    ),
+    (
+        lambda: internal_model_margin(np.ones(4), played(np.ones((1, 2, 4)))),
+        r"control_filter must be \(2 loudspeakers, 1 microphones",
+    ),
+    (lambda: internal_model_margin([1.0], played(DELAY), np.ones((2, 1, 4))), "estimate must have the channels of the"),
+    (lambda: internal_model_margin([1.0], played(DELAY), OTHER_RATE), "estimate is sampled at 16000 Hz"),
+    (lambda: internal_model_margin(np.zeros((2, 1, 4)), played(np.ones((1, 2, 4)))).loop, "that of one channel"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), REFUSED, ids=range(len(REFUSED)))
+def test_what_is_refused(call: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()

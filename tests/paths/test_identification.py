@@ -1,5 +1,6 @@
 """Identification: exact recovery, lstsq as the oracle, what noise and clipping do to it."""
 
+import math
 import tracemalloc
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import scipy.signal
 from scipy.signal import fftconvolve, lfilter
 
+from kfopc_filterpy import Plant
 from kfopc_filterpy.paths.identification import (
     estimate_path,
     identify_secondary_path,
@@ -17,7 +19,8 @@ from kfopc_filterpy.paths.models import bandpass_path, path_taps
 from kfopc_filterpy.paths.uncertainty import path_uncertainty
 
 FS = 16000.0
-PATH = bandpass_path(32)
+PATH = bandpass_path(32, fs=FS)
+PLANT = Plant(PATH)
 
 
 @pytest.mark.parametrize(("n_loudspeakers", "n_samples"), [(1, 7000), (2, 12000)])
@@ -51,7 +54,7 @@ def test_30_000_taps_take_no_matrix():
 
 
 def test_frequencies_of_the_error_can_be_chosen():
-    result = identify_secondary_path(PATH, n_taps=16, duration_s=0.2, rng=7, frequencies_hz=[100.0, 1000.0])
+    result = identify_secondary_path(PLANT, n_taps=16, duration_s=0.2, rng=7, frequencies_hz=[100.0, 1000.0])
     np.testing.assert_array_equal(result.frequencies_hz, [100.0, 1000.0])
     omega = 2 * np.pi * np.array([100.0, 1000.0]) / FS
     true = scipy.signal.freqz(path_taps(PATH), worN=omega)[1]
@@ -75,14 +78,13 @@ def test_error_measures_have_floors_and_lengths():
         ({"excitation": "pink"}, "excitation must be one of 'white', 'sweep'"),
         ({"duration_s": 0.001}, "duration_s must be at least 0.00394 s for 32 taps"),
         ({"level": 0.0}, "level must be greater than 0"),
-        ({"fs": 8000.0}, "secondary_path is sampled at 16000 Hz"),
-        ({"amplifier": lambda u: u[:-1]}, r"amplifier\(excitation\) must have 1600 values"),
-        ({"amplifier": lambda u: 0 * u}, "response must not be silent"),
+        ({"plant": Plant(PATH, amplifier=lambda u: math.nan)}, "amplifier must return a finite number, got nan"),
+        ({"plant": Plant(PATH, amplifier=lambda u: 0 * u)}, "response must not be silent"),
     ],
 )
 def test_identification_refuses(changes, message):
     with pytest.raises(ValueError, match=message):
-        identify_secondary_path(PATH, **{"n_taps": 32, "duration_s": 0.1, "rng": 0, **changes})
+        identify_secondary_path(**{"plant": PLANT, "n_taps": 32, "duration_s": 0.1, "rng": 0} | changes)
 
 
 @pytest.mark.parametrize(
@@ -106,10 +108,11 @@ def test_level_is_the_root_mean_square_of_the_excitation(excitation, peak):
         sent.append(u)
         return u
 
-    identify_secondary_path(PATH, n_taps=32, duration_s=2.0, rng=0, excitation=excitation, level=2.0, amplifier=record)
+    plant = Plant(PATH, amplifier=record)
+    identify_secondary_path(plant, n_taps=32, duration_s=2.0, rng=0, excitation=excitation, level=2.0)
     # 32000 samples: noise within 1 %; a sweep's first, partial period weighs about as much.
-    assert np.sqrt(np.mean(sent[0] ** 2)) == pytest.approx(2.0, rel=0.02)
-    assert np.abs(sent[0]).max() <= peak * (1 + 1e-12)
+    assert np.sqrt(np.mean(np.square(sent))) == pytest.approx(2.0, rel=0.02)
+    assert np.abs(sent).max() <= peak * (1 + 1e-12)
 
 
 SHORT_PATH = np.concatenate([np.zeros(3), np.random.default_rng(8).standard_normal(29) * np.exp(-np.arange(29) / 8)])
@@ -123,11 +126,9 @@ TWO_BY_TWO = np.random.default_rng(9).standard_normal((2, 2, 24)) * np.exp(-np.a
 def test_the_uncertainty_bounds_the_true_error_and_is_of_its_size(path, noise, n_taps, loudspeakers):
     """Over 257 frequencies and five seeds. The bound of a matrix adds all its errors, so it is wider."""
     taps = path.shape[-1] // (2 if n_taps == "half" else 1)
-    ratios = []
+    plant, ratios = Plant(path, fs=8000, sensor_noise_std=noise), []
     for seed in range(5):
-        result = identify_secondary_path(
-            path, n_taps=taps, duration_s=1.0, rng=seed, fs=8000.0, sensor_noise_std=noise, loudspeakers=loudspeakers
-        )
+        result = identify_secondary_path(plant, n_taps=taps, duration_s=1.0, rng=seed, loudspeakers=loudspeakers)
         assert result.uncertainty.shape == (257,)
         error = path_uncertainty(np.reshape(path, (1, *path.shape)), result.taps)  # the true path as a measured one
         ratios.append(result.uncertainty / error)
@@ -147,9 +148,9 @@ def test_an_excitation_without_high_frequencies_leaves_them_uncertain():
 
 
 def test_the_uncertainty_falls_with_the_root_of_the_duration():
+    plant = Plant(SHORT_PATH, fs=8000, sensor_noise_std=0.2)
+
     def mean(duration_s):
-        return identify_secondary_path(
-            SHORT_PATH, n_taps=32, duration_s=duration_s, rng=3, fs=8000.0, sensor_noise_std=0.2
-        ).uncertainty.mean()
+        return identify_secondary_path(plant, n_taps=32, duration_s=duration_s, rng=3).uncertainty.mean()
 
     assert mean(16.0) / mean(4.0) == pytest.approx(0.5, rel=0.1)

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from helpers.files import FS, rew_text, write_sofa, write_uff
 
-from kfopc_filterpy.paths import frequency_response, path_taps, read_path, resample_path
-from kfopc_filterpy.paths.duct import Duct, duct_paths
+from kfopc_filterpy.paths import duct_plant, frequency_response, read_path, resample_path
 from kfopc_filterpy.signals import read_recording, write_wav
 
 
 def test_a_path_at_another_rate_is_resampled_as_a_path_and_a_recording_keeps_its_height(tmp_path):
-    taps = path_taps(duct_paths(Duct(), fs=48000).secondary).astype(np.float32).astype(float)
+    taps = duct_plant(fs=48000).secondary[0, 0].astype(np.float32).astype(float)
     write_wav(tmp_path / "s.wav", [taps, -0.5 * taps], 48000)
     both = read_path(tmp_path / "s.wav", fs=16000, unit="Pa/V", unit_per_full_scale=0.14)
     assert (both.fs, both.file_fs, both.unit) == (16000, 48000, "Pa/V")

@@ -3,9 +3,8 @@
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-import scipy.signal
 
-from kfopc_filterpy import power_constrained_wiener
+from kfopc_filterpy import Plant, power_constrained_wiener
 from kfopc_filterpy.bounds.wiener import wiener_solution
 from kfopc_filterpy.paths.analysis import frequency_response
 from kfopc_filterpy.paths.identification import identify_secondary_path
@@ -22,13 +21,14 @@ from kfopc_filterpy.plot.paths import (
 )
 
 FS = 16000.0
-P, S = bandpass_path(128), bandpass_path(32)
+P, S = bandpass_path(128, fs=FS), bandpass_path(32, fs=FS)
+PLANT = Plant(S, P)
 
 
 def _solution():
     x = np.random.default_rng(0).standard_normal(4000)
-    d = scipy.signal.lfilter(path_taps(P), 1.0, x) + 0.2 * np.random.default_rng(1).standard_normal(4000)
-    return wiener_solution(x, d, S, 64)
+    d = PLANT.disturbance(x) + 0.2 * np.random.default_rng(1).standard_normal(4000)
+    return wiener_solution(x, PLANT, n_taps=64, disturbance=d)
 
 
 def _labels(ax):
@@ -65,7 +65,7 @@ def test_impulse_response_and_group_delay_are_in_milliseconds():
 
 @pytest.mark.parametrize(("primary", "secondary", "text"), [(P, S, "2.81 ms (45"), (S, P, "-2.81 ms (-45")])
 def test_causality_margin_is_written_out(primary, secondary, text):
-    ax = plot_causality_margin(primary, secondary)
+    ax = plot_causality_margin(Plant(secondary, primary))
     ax.figure.canvas.draw()
     assert any(text in label.get_text() for label in ax.texts)
     assert _labels(ax) == ["Primary path P", "Secondary path S"]
@@ -75,7 +75,7 @@ def test_causality_margins_of_several_channels_are_a_table():
     delays = np.array([[10, 38], [20, 24], [-1, 12]])  # -1: silent
     secondary = np.vstack([np.eye(64), np.zeros(64)])[delays]
     primary = np.eye(64)[[[30], [36], [44]]]
-    ax = plot_causality_margin(primary, secondary, fs=FS)
+    ax = plot_causality_margin(Plant(secondary, primary, fs=FS))
     ax.figure.canvas.draw()
     expected = [["1.25", "-0.50"], ["1.00", "0.75"], ["silent", "2.00"]]
     written = {text.get_position(): text.get_text() for text in ax.texts}
@@ -103,7 +103,8 @@ def test_required_rated_power_of_several_loudspeakers_has_a_line_for_each():
     paths = np.zeros((2, 3, 4))
     paths[:, :2, 1] = [[1.0, 0.3], [0.2, 0.5]]
     d = np.array([np.roll(x[0], 2), 0.5 * np.roll(x[0], 3)]) + 0.1 * np.random.default_rng(1).standard_normal((2, 3000))
-    free = power_constrained_wiener(x, d, paths, 8, 100.0, fs=8000.0).unconstrained
+    plant = Plant(paths, fs=8000)
+    free = power_constrained_wiener(x, plant, n_taps=8, rated_power=100.0, disturbance=d).unconstrained
     ax = plot_required_rated_power(free, rated_power=0.5)
     ax.figure.canvas.draw()
     assert _labels(ax)[:2] == [f"Wiener filter scaled by α, loudspeaker {j}" for j in range(2)]
@@ -119,14 +120,15 @@ def test_required_rated_power_of_several_loudspeakers_has_a_line_for_each():
 def test_modelling_error_has_a_curve_for_each_path():
     taps = path_taps(S)
     paths = np.array([[taps, 0.5 * taps, taps[::-1]], [2 * taps, -taps, taps]])
-    result = identify_secondary_path(paths, n_taps=32, duration_s=0.2, rng=0, fs=FS, sensor_noise_std=0.1)
+    plant = Plant(paths, fs=FS, sensor_noise_std=0.1)
+    result = identify_secondary_path(plant, n_taps=32, duration_s=0.2, rng=0)
     ax = plot_modelling_error({"in turn": result})
     assert ax.get_ylabel() == "Modelling error (dB)"
     assert len(ax.get_lines()) == 6
     np.testing.assert_array_equal(ax.get_lines()[4].get_ydata(), result.modelling_error_db[1, 1])
     low, high = result.misalignment_db.min(), result.misalignment_db.max()
     assert _labels(ax) == [f"in turn, 6 paths: {low:.1f} to {high:.1f} dB overall"]
-    one = identify_secondary_path(S, n_taps=32, duration_s=0.2, rng=0)
+    one = identify_secondary_path(PLANT, n_taps=32, duration_s=0.2, rng=0)
     assert len(plot_modelling_error(one).get_lines()) == 1
 
 
@@ -135,11 +137,11 @@ def test_modelling_error_has_a_curve_for_each_path():
     [
         lambda ax: plot_impulse_responses(S, ax=ax),
         lambda ax: plot_group_delay(S, ax=ax),
-        lambda ax: plot_causality_margin(P, S, ax=ax),
+        lambda ax: plot_causality_margin(PLANT, ax=ax),
         lambda ax: plot_secondary_path_gain(S, ax=ax),
         lambda ax: plot_phase_error(S, S, ax=ax),
         lambda ax: plot_required_rated_power(_solution(), ax=ax),
-        lambda ax: plot_modelling_error(identify_secondary_path(S, n_taps=8, duration_s=0.1, rng=0), ax=ax),
+        lambda ax: plot_modelling_error(identify_secondary_path(PLANT, n_taps=8, duration_s=0.1, rng=0), ax=ax),
     ],
 )
 def test_given_axes_are_used_and_returned(draw):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.results import multichannel_result
 
-from kfopc_filterpy import FxLMS, MOVFxLMS, kf_anc, kf_opc, simulate
+from kfopc_filterpy import Plant, fx_lms, kf_anc, kf_opc, mov_fx_lms, simulate
 from kfopc_filterpy import plot as plotting
 from kfopc_filterpy.metrics import coherence_and_gain, nse_db, power_spectrum_db, short_time_power
 from kfopc_filterpy.paths.models import bandpass_path
@@ -15,7 +15,8 @@ from kfopc_filterpy.power.amplifiers import HardClipAmplifier
 from kfopc_filterpy.signals import band_limited_noise, scaled_to_power, tone
 
 FS = 16000.0
-P, S = bandpass_path(128), bandpass_path(32)
+S, P = bandpass_path(32, fs=FS), bandpass_path(128, fs=FS)
+PLANT = Plant(S, P)
 LIMIT = np.sqrt(2)
 SPAN = (0.38, 0.39)
 
@@ -23,10 +24,10 @@ SPAN = (0.38, 0.39)
 def _controllers():
     noise = {"state_noise": 1e-8, "measurement_noise": 1e-2}
     return (
-        kf_anc(16, S, **noise),
-        kf_opc(16, S, rated_power=1.0, **noise),
-        FxLMS(16, S, step_size=1e-3),
-        MOVFxLMS(16, S, step_size=1e-3, rated_power=1.0),
+        kf_anc(16, PLANT, **noise),
+        kf_opc(16, PLANT, rated_power=1.0, **noise),
+        fx_lms(16, PLANT, step_size=1e-3),
+        mov_fx_lms(16, PLANT, step_size=1e-3, rated_power=1.0),
     )
 
 
@@ -34,22 +35,22 @@ def _controllers():
 def tonal():
     """Runs of a tone of twice the rated power into a clipping amplifier, by algorithm."""
     x = scaled_to_power(tone(400.0, 0.4, fs=FS), 2.0)
-    plant = {"secondary_path": S, "primary_path": P, "amplifier": HardClipAmplifier(LIMIT), "rated_power": 1.0}
-    runs = [simulate(controller, x, record_weights_every=16, **plant) for controller in _controllers()]
-    return {run.algorithm: run for run in runs}
+    clipping = Plant(S, P, amplifier=HardClipAmplifier(LIMIT))
+    return {run.algorithm: run for run in simulate(_controllers(), x, clipping, record_weights_every=16)}
 
 
 @pytest.fixture(scope="module")
 def noise():
     """Two seeds of a run of KF-OPC in noise."""
     signals = [band_limited_noise((200.0, 2000.0), 1.2, fs=FS, power=4.0, rng=seed) for seed in (1, 2)]
-    return [simulate(_controllers()[1], x, secondary_path=S, primary_path=P) for x in signals]
+    return [simulate(_controllers()[1], x, PLANT) for x in signals]
 
 
 def _steady_noise(duration_s, fs):
     """A run whose error and disturbance are white noise of equal power."""
     d, e = np.random.default_rng(1).standard_normal((2, round(duration_s * fs)))
-    run = simulate(FxLMS(1, [1.0], step_size=1e-9), d, disturbance=d, secondary_path=[1.0], fs=fs)
+    plant = Plant([1.0], [1.0], fs=fs)
+    run = simulate(fx_lms(1, plant, step_size=1e-9), d, plant)
     return replace(run, error=e)
 
 
@@ -227,6 +228,30 @@ def test_files_are_the_same_for_the_same_figure_and_the_figure_is_closed(tonal, 
     assert not plt.get_fignums()
     with pytest.raises(ValueError, match="must leave out the suffix"):
         plotting.save_figure(ax.figure, tmp_path / "nse.svg")
+
+
+@pytest.mark.parametrize("kind", ["one channel", "several", "several ratings", "diverged"])
+def test_a_run_draws_its_error_its_power_and_its_spectra(tonal, kind):
+    run = {
+        "one channel": tonal["KF-OPC"],
+        "several": multichannel_result(),
+        "several ratings": multichannel_result(rated_power=np.array([1.0, 0.5])),
+        "diverged": _diverged(tonal["FxLMS"]),
+    }[kind]
+    figure = run.plot()
+    figure.canvas.draw()
+    level, power, spectra = figure.axes
+    first = (run.error[0], run.disturbance[0]) if "several" in kind else (run.error, run.disturbance)
+    line = next(line for line in level.get_lines() if line.get_label().startswith(run.algorithm))
+    rows = np.round(line.get_xdata() * FS).astype(int) - 1
+    np.testing.assert_array_equal(line.get_ydata(), nse_db(*first, FS)[rows])
+    assert [ax.get_xlabel() for ax in figure.axes] == ["Time (s)", "Time (s)", "Frequency (Hz)"]
+    ratings = [label for label in _labels(power) if label.startswith("Rated")]
+    assert ratings == {"several ratings": ["Rated power 0.5", "Rated power 1"], "diverged": []}.get(
+        kind, ["Rated power 1"]
+    )
+    assert "Disturbance" in _labels(spectra)
+    assert not plt.get_fignums()  # nothing is left open in pyplot
 
 
 # ---- several channels

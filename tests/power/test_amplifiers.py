@@ -8,11 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kfopc_filterpy import (
-    FxLMS,
     HardClipAmplifier,
     LinearAmplifier,
+    Plant,
     SoftSaturationAmplifier,
     clipped_fraction,
+    fx_lms,
     simulate,
 )
 from kfopc_filterpy.power.amplifiers import compiled_model
@@ -98,8 +99,8 @@ def test_a_subclass_is_called_not_replaced_by_its_parents_equation():
         def __call__(self, signal):
             return 0.5 * super().__call__(signal)
 
-    x = np.random.default_rng(0).standard_normal(50)
-    result = simulate(FxLMS(4, [1.0], step_size=0.1), x, disturbance=x, secondary_path=[1.0], amplifier=Weak(1.0))
+    plant = Plant([1.0], [1.0], amplifier=Weak(1.0), fs=8000)
+    result = simulate(fx_lms(4, plant, step_size=0.1), np.random.default_rng(0).standard_normal(50), plant)
     np.testing.assert_array_equal(result.amplifier_output, 0.5 * np.clip(result.control_signal, -1, 1))
 
 

@@ -164,7 +164,7 @@ def test_a_bad_sample_changes_nothing(bad: object, position: int) -> None:
 )
 def test_settings_out_of_range(kwargs: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(kwargs))):
-        OutputPowerConstraint(**{"rated_power": 1.0} | kwargs)
+        OutputPowerConstraint(**{"rated_power": 1.0, "fs": FS} | kwargs)
 
 
 @pytest.mark.parametrize("name", ["factor", "disturbance_power", "secondary_path_gain", "rated_power"])

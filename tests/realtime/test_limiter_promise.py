@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy import FxLMS, LimitedController, OutputLimiter
+from kfopc_filterpy import LimitedController, OutputLimiter, fx_lms
 from kfopc_filterpy.realtime import Supervisor
 
 FS, BLOCK, WINDOW, RATED = 8000.0, 32, 80, 0.5
@@ -42,7 +42,7 @@ class Loud:
 
 MAKERS: dict[str, Any] = {
     "a user's": lambda: LimitedController(Loud(), limiter()),
-    "FxLMS": lambda: FxLMS(
+    "FxLMS": lambda: fx_lms(
         16, PATH, step_size=0.05, limiter=limiter()
     ),  # it diverges, and is often beyond largest_gain
 }

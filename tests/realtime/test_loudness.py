@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.io import loadmat
 from scipy.signal import resample_poly
 
-from kfopc_filterpy import FxLMS, FxNLMS, OutputLimiter, OutputPowerConstraint, kf_opc, kf_pb, signals
+from kfopc_filterpy import OutputLimiter, OutputPowerConstraint, Plant, fx_lms, fx_nlms, kf_opc, kf_pb, signals
 from kfopc_filterpy.commands.run import summarize
 from kfopc_filterpy.controllers import VirtualMicrophones, with_internal_model
 from kfopc_filterpy.realtime import SimulatedInterface, Supervisor, run
@@ -99,14 +99,24 @@ def limiter(rated_power: float = 3.0) -> OutputLimiter:
 
 MAKERS: dict[str, Any] = {
     "KF-OPC": lambda path: kf_opc(24, path, constraint=OutputPowerConstraint(3.0, fs=FS), **KALMAN),
-    "FxLMS": lambda path: FxLMS(24, path, step_size=1e-3, limiter=limiter()),
+    "FxLMS": lambda path: fx_lms(24, path, step_size=1e-3, limiter=limiter()),
 }
 
 
-def controlled(controller: Any, *, x: Any = NOISE, secondary: Any = S, disturbance: Any = None, **changed: Any) -> Any:
-    """Return supervisor, errors and disturbances of a run to the end of the noise."""
-    noise = {"primary_path": PRIMARY} if disturbance is None else {"disturbance": disturbance}
-    interface = SimulatedInterface(x, secondary, fs=FS, block=BLOCK, latency=BLOCK, **noise)
+def controlled(
+    controller: Any,
+    *,
+    x: Any = NOISE,
+    secondary: Any = S,
+    from_4_s: Any = None,
+    disturbance: Any = None,
+    **changed: Any,
+) -> Any:
+    """Return supervisor, errors and disturbances of a run to the end of the noise, with another path from 4 s on."""
+    plant = Plant(secondary, PRIMARY if disturbance is None else None, fs=FS)
+    if from_4_s is not None:
+        plant = plant.changed_at(4.0, secondary=from_4_s)
+    interface = SimulatedInterface(x, plant, disturbance=disturbance, block=BLOCK, latency=BLOCK)
     supervisor, errors = Supervisor(controller, **{"fs": FS, "amplitude_limit": 20.0} | changed), []
     while (block := interface.read()) is not None:
         errors.append(block.errors[0])
@@ -167,8 +177,7 @@ def test_the_reaction_is_that_to_other_divergences(action: str) -> None:
 
 def test_a_frozen_state_that_is_louder_is_not_good_any_more() -> None:
     """The polarity changes at 4 s. What was good then is as wrong as what is learned after it."""
-    secondary = [(0.0, S), (4.0, -S)]
-    supervisor, e, d = controlled(MAKERS["KF-OPC"](PATH), secondary=secondary, on_divergence="freeze", pause_s=10.0)
+    supervisor, e, d = controlled(MAKERS["KF-OPC"](PATH), from_4_s=-S, on_divergence="freeze", pause_s=10.0)
     assert supervisor.health.counts[BLAMED] == 2
     assert db(e, d, times(supervisor, BLAMED)[1], SECONDS) == pytest.approx(0.0, abs=0.1)  # a fresh one plays nothing
     assert db(e, d, 2.0, 4.0) < -10.0
@@ -176,9 +185,9 @@ def test_a_frozen_state_that_is_louder_is_not_good_any_more() -> None:
 
 def test_a_path_that_became_longer_is_in_the_report_of_a_run() -> None:
     """And three times within ten minutes end it."""
-    secondary = [(0.0, S), (3.0, np.concatenate((np.zeros(32), S)))]
     x = np.tile(NOISE, 3)
-    interface = SimulatedInterface(x, secondary, primary_path=PRIMARY, fs=FS, block=BLOCK, latency=BLOCK)
+    plant = Plant(S, PRIMARY, fs=FS).changed_at(3.0, secondary=np.concatenate((np.zeros(32), S)))
+    interface = SimulatedInterface(x, plant, block=BLOCK, latency=BLOCK)
     report = run(
         lambda plant: MAKERS["KF-OPC"](plant.taps), interface, amplitude_limit=20.0, listen_s=1.0, identify_s=2.0
     )
@@ -204,7 +213,7 @@ LOUD: dict[str, Any] = {
 }
 SOUND = {
     "KF-OPC": MAKERS["KF-OPC"],
-    "FxLMS": lambda path: FxLMS(24, path, step_size=2e-4, limiter=limiter()),  # a larger one is louder than a swell
+    "FxLMS": lambda path: fx_lms(24, path, step_size=2e-4, limiter=limiter()),  # a larger one is louder than a swell
     "KF-PB": lambda path: kf_pb(24, path, rated_power=3.0, fs=FS, limiter=limiter()),
     "KF-PB, wrong polarity": lambda path: kf_pb(24, -path, rated_power=3.0, fs=FS, limiter=limiter()),
 }
@@ -233,10 +242,8 @@ def test_recorded_machines_are_no_alarm(noise: str, shared_data: Path) -> None:
     primary, secondary = (
         np.concatenate((np.zeros(80), loadmat(shared_data / "author/Path.mat")[p].ravel())) for p in "PS"
     )
-    interface = SimulatedInterface(
-        x / np.std(x), secondary[80:], primary_path=primary, fs=16000.0, block=80, latency=80
-    )
-    supervisor = Supervisor(FxNLMS(128, secondary[:336], step_size=0.02), fs=16000.0, amplitude_limit=1e6)
+    interface = SimulatedInterface(x / np.std(x), Plant(secondary[80:], primary, fs=16000.0), block=80, latency=80)
+    supervisor = Supervisor(fx_nlms(128, secondary[:336], step_size=0.02), fs=16000.0, amplitude_limit=1e6)
     while (block := interface.read()) is not None:
         interface.write(supervisor.process(block.references[0], block.errors[0])[np.newaxis])
     assert not times(supervisor, LOUDER)
@@ -250,10 +257,10 @@ def test_noise_that_becomes_louder_unheard_by_a_reference_costs_a_silence(contro
     own = np.interp(np.arange(n) / FS, [3.5, 3.501, 6.0, 6.001], [0.0, 3.0, 3.0, 6.0]) * rng.standard_normal(n)
     if control == "feedback":
         tone = np.sin(0.2 * np.arange(n)) + 0.1 * rng.standard_normal(n)
-        controller: Any = with_internal_model(FxNLMS(24, PATH, step_size=0.02))
+        controller: Any = with_internal_model(fx_nlms(24, PATH, step_size=0.02))
         supervisor, e, d = controlled(controller, x=None, disturbance=tone + own)
     else:
-        controller = FxLMS(24, PATH, step_size=2e-4)
+        controller = fx_lms(24, PATH, step_size=2e-4)
         supervisor, e, d = controlled(controller, disturbance=np.convolve(NOISE, PRIMARY)[:n] + own)
     assert len(times(supervisor, LOUDER)) == len(times(supervisor, CLEARED)) == 2
     assert times(supervisor, LOUDER)[0] == pytest.approx(4.25, abs=0.26)  # two windows of four are much louder
@@ -303,7 +310,7 @@ def test_a_silence_without_usable_samples_tells_nothing() -> None:
 
 def test_virtual_microphones_are_not_watched_and_begin_at_once() -> None:
     paths = np.stack((PATH, PATH))[:, np.newaxis]
-    ears = VirtualMicrophones(FxLMS(8, paths[1:], step_size=0.01), paths, [[[1.0]]], physical=[0])
+    ears = VirtualMicrophones(fx_lms(8, paths[1:], step_size=0.01), paths, [[[1.0]]], physical=[0])
     supervisor = Supervisor(ears, fs=FS, amplitude_limit=20.0)
     assert not supervisor.muted
     errors = np.stack((NOISE, NOISE))

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from kfopc_filterpy import KFOPC, FxLMS, KalmanController, OutputPowerConstraint, kf_anc, kf_opc
+from kfopc_filterpy import KFOPC, KalmanController, OutputPowerConstraint, Plant, fx_lms, kf_anc, kf_opc
 from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.realtime import Health, SimulatedInterface, Supervisor
 
@@ -30,10 +30,10 @@ LIMIT = 4.0
 
 KALMAN = {"state_noise": 1e-7, "measurement_noise": 1e-2, "initial_variance": 1e-2}
 MAKERS: dict[str, Any] = {
-    "FxLMS": lambda: FxLMS(24, PATH, step_size=1e-3),
+    "FxLMS": lambda: fx_lms(24, PATH, step_size=1e-3),
     "KF-OPC": lambda: kf_opc(24, PATH, constraint=OutputPowerConstraint(0.5, fs=FS), **KALMAN),
-    "FxLMS of several channels": lambda: FxLMS(16, PATHS, step_size=3e-4),
-    "hybrid FxLMS of several channels": lambda: with_internal_model(FxLMS(16, PATHS, step_size=3e-4, n_references=3)),
+    "FxLMS of several channels": lambda: fx_lms(16, PATHS, step_size=3e-4),
+    "hybrid FxLMS of several channels": lambda: with_internal_model(fx_lms(16, PATHS, step_size=3e-4, n_references=3)),
 }
 
 
@@ -66,7 +66,7 @@ def plant(several: bool = False, seconds: float = 3.0, **changed: Any) -> Simula
     x = np.random.default_rng(5).standard_normal(round(seconds * FS))
     primary = np.stack((PRIMARY, 0.7 * PRIMARY))[:, np.newaxis] if several else PRIMARY
     secondary = PATHS[..., LATENCY:] if several else S
-    return SimulatedInterface(x, secondary, primary_path=primary, fs=FS, block=BLOCK, latency=LATENCY, **changed)
+    return SimulatedInterface(x, Plant(secondary, primary, fs=FS), block=BLOCK, latency=LATENCY, **changed)
 
 
 def loop(supervisor: Supervisor, interface: SimulatedInterface, spoil: Any = None) -> tuple[np.ndarray, np.ndarray]:
@@ -248,7 +248,7 @@ def test_the_noise_reduction_recovers_within_half_a_second(name: str, length: in
 
 
 def diverging(**changed: Any) -> Supervisor:
-    return supervised(FxLMS(24, -PATH, step_size=3e-3), **changed)  # wrong sign: it must diverge
+    return supervised(fx_lms(24, -PATH, step_size=3e-3), **changed)  # wrong sign: it must diverge
 
 
 @pytest.mark.parametrize("action", ["mute", "reset", "freeze"])
@@ -276,8 +276,8 @@ def test_a_divergence_is_noticed_and_acted_on(action: str) -> None:
 def test_louder_noise_is_no_divergence(name: str, up_db: int) -> None:
     x = np.random.default_rng(5).standard_normal(32000)
     x[16000:] *= 10.0 ** (up_db / 20)
-    noise = SimulatedInterface(1e-2 * x, S, primary_path=PRIMARY, fs=FS, block=BLOCK, latency=LATENCY)
-    controller = FxLMS(24, PATH, step_size=1e-6) if name == "FxLMS" else MAKERS[name]()
+    noise = SimulatedInterface(1e-2 * x, Plant(S, PRIMARY, fs=FS), block=BLOCK, latency=LATENCY)
+    controller = fx_lms(24, PATH, step_size=1e-6) if name == "FxLMS" else MAKERS[name]()
     supervisor = supervised(controller, amplitude_limit=1e3, full_scale=1e3)
     loop(supervisor, noise)
     assert not supervisor.health.counts
@@ -331,9 +331,9 @@ def test_an_internal_model_knows_of_fades_limits_and_bad_errors(n_references: in
     n, rng = round(4 * FS), np.random.default_rng(3)
     d, x = np.sin(0.2 * np.arange(n)) + 0.05 * rng.standard_normal(n), rng.standard_normal((n_references, n))
     path = PATH[np.newaxis, np.newaxis] if n_references else PATH
-    supervisor = supervised(with_internal_model(FxLMS(24, path, step_size=1e-3, n_references=1 + n_references)))
+    supervisor = supervised(with_internal_model(fx_lms(24, path, step_size=1e-3, n_references=1 + n_references)))
     interface = SimulatedInterface(
-        x if n_references else None, path[..., LATENCY:], disturbance=d, fs=FS, block=BLOCK, latency=LATENCY
+        x if n_references else None, Plant(path[..., LATENCY:], fs=FS), disturbance=d, block=BLOCK, latency=LATENCY
     )
     out, back, spoilt, end = 20000, 22080, 22496, 22688  # the first samples of blocks
     weights = []
@@ -362,11 +362,11 @@ def test_a_controller_with_a_longer_path_begins_as_if_nothing_had_been_played() 
     d = np.sin(0.2 * np.arange(n)) + 0.05 * np.random.default_rng(3).standard_normal(n)
 
     def made(path: np.ndarray) -> Any:
-        return with_internal_model(FxLMS(24, path, step_size=1e-3))
+        return with_internal_model(fx_lms(24, path, step_size=1e-3))
 
     def played(path: np.ndarray, d: np.ndarray, spoil: Any) -> tuple[np.ndarray, Supervisor]:
         supervisor = supervised(made(path))
-        interface = SimulatedInterface(None, S, disturbance=d, fs=FS, block=BLOCK, latency=LATENCY)
+        interface = SimulatedInterface(None, Plant(S, fs=FS), disturbance=d, block=BLOCK, latency=LATENCY)
         return loop(supervisor, interface, lambda x, e, first: spoil(supervisor, e, first))[0], supervisor
 
     def assign(supervisor: Supervisor, e: np.ndarray, first: int) -> tuple[None, np.ndarray]:
@@ -387,9 +387,9 @@ def test_a_frozen_internal_model_goes_on_with_the_reference_that_it_had() -> Non
     n, window = round(2 * FS), 2000
     d = np.sin(0.2 * np.arange(n)) + 0.05 * np.random.default_rng(3).standard_normal(n)
     supervisor = supervised(
-        with_internal_model(FxLMS(24, PATH, step_size=1e-3)), on_divergence="freeze", pause_s=0.5, window_s=window / FS
+        with_internal_model(fx_lms(24, PATH, step_size=1e-3)), on_divergence="freeze", pause_s=0.5, window_s=window / FS
     )
-    interface = SimulatedInterface(None, S, disturbance=d, fs=FS, block=BLOCK, latency=LATENCY)
+    interface = SimulatedInterface(None, Plant(S, fs=FS), disturbance=d, block=BLOCK, latency=LATENCY)
     weights = []
 
     def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[None, np.ndarray]:
@@ -432,7 +432,7 @@ def test_fades_are_smooth() -> None:
         ({"full_scale": -1.0}, "full_scale must be greater than 0"),
         ({"controller": object()}, "controller must have control_signal"),
         (
-            {"controller": kf_opc(8, PATH, rated_power=1.0, state_noise=1e-6, measurement_noise=1e-2)},
+            {"controller": kf_opc(8, PATH, rated_power=1.0, fs=16000, state_noise=1e-6, measurement_noise=1e-2)},
             "fs is 8000 Hz but",
         ),
     ],

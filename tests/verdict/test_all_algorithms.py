@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kfopc_filterpy import FxLMS, FxNLMS, noise_reduction_db, nse_db, simulate
+from kfopc_filterpy import Plant, fx_lms, fx_nlms, noise_reduction_db, nse_db, simulate
 from kfopc_filterpy.controllers.table import CORE
 from kfopc_filterpy.signals import band_limited_noise
 from kfopc_filterpy.verdict import assess
@@ -19,8 +19,8 @@ PRIMARY, SECONDARY = np.eye(24)[14] + 0.4 * np.eye(24)[17], np.eye(12)[6]
 
 
 def on(x=NOISE, primary=PRIMARY, secondary=SECONDARY, **options):
-    options = {"rating": 100.0, "fs": FS, "n_taps": TAPS, "beside": "all"} | options
-    return assess(x, primary, secondary, **options)
+    options = {"rating": 100.0, "n_taps": TAPS, "beside": "all"} | options
+    return assess(x, Plant(secondary, primary, fs=FS), **options)
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +41,8 @@ def test_the_step_that_runs_is_the_best_on_the_start_of_the_record(verdict):
     step = plan.best("FxLMS", verdict.limits)["step_size"]
 
     def mean_nse(step: float) -> float:
-        own = FxLMS(TAPS, SECONDARY, step_size=step)
-        run = simulate(own, NOISE, disturbance=d, secondary_path=SECONDARY, fs=FS, switch_on_s=0.25)
+        own = fx_lms(TAPS, SECONDARY, step_size=step)
+        run = simulate(own, NOISE, Plant(SECONDARY, fs=FS), disturbance=d, switch_on_s=0.25)
         return np.inf if run.diverged_at_s else float(np.nanmean(nse_db(run.error, run.disturbance, FS, 0.1)))
 
     assert mean_nse(step) == min(mean_nse(factor * step) for factor in (0.5, 1.0, 2.0))
@@ -53,8 +53,8 @@ def test_the_settings_that_ran_are_told(verdict):
     assert verdict.figures["KF-PB"]["settings"] == {}  # nothing to choose
     settings = verdict.figures["FxNLMS"]["settings"]
     d = np.convolve(NOISE, PRIMARY)[: NOISE.size]
-    own = FxNLMS(TAPS, SECONDARY, **settings)
-    again = simulate(own, NOISE - NOISE.mean(), disturbance=d, secondary_path=SECONDARY, fs=FS, switch_on_s=0.3)
+    own = fx_nlms(TAPS, SECONDARY, **settings)
+    again = simulate(own, NOISE - NOISE.mean(), Plant(SECONDARY, fs=FS), disturbance=d, switch_on_s=0.3)
     reached = noise_reduction_db(again.error, again.disturbance)
     assert verdict.figures["FxNLMS"]["noise_reduction_db"] == pytest.approx(reached, abs=0.01)  # offsets are subtracted
     assert f"step_size={settings['step_size']:.6g}, regularization=" in "\n".join(algorithms_table(verdict).lines)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.signal import firwin, welch
 
-from kfopc_filterpy import __version__
+from kfopc_filterpy import Plant, __version__
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
 from kfopc_filterpy.signals import Recording, band_limited_noise
 from kfopc_filterpy.verdict import assess
@@ -42,14 +42,15 @@ def heard(primary: np.ndarray, other_db: float) -> np.ndarray:
 
 
 SECONDARY = arriving(6, length=16)
+PLANT = Plant(SECONDARY, arriving(20), fs=FS)
 
 
 def on(x=None, primary=None, secondary=SECONDARY, **options):
     """The verdict on KF-PB alone, by default on a scene in which nothing is wrong."""
-    options = {"rating": PLENTY, "fs": FS, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None} | options
+    options = {"rating": PLENTY, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None} | options
     if primary is None and "disturbance" not in options:
         primary = arriving(20)
-    return assess(noise() if x is None else x, primary, secondary, **options)
+    return assess(noise() if x is None else x, Plant(secondary, primary, fs=FS), **options)
 
 
 @functools.cache
@@ -172,7 +173,7 @@ def watts(sine_watt: float) -> AmplifierRating:
 def test_the_least_rating_is_one_answer_whatever_is_typed_and_typed_back_it_is_just_enough(kind, algorithm):
     def on(rated: float):
         options: dict = {"algorithm": algorithm, "beside": (), "secondary_path_uncertainty": None, "n_taps": TAPS}
-        return assess(noise(), arriving(20), arriving(6, length=16), rating=kind(rated), fs=FS, want_db=8.0, **options)
+        return assess(noise(), PLANT, rating=kind(rated), want_db=8.0, **options)
 
     few, many = on(0.01), on(1000.0)
     assert (few.limited_by, many.enough) == ("amplifier", True)
@@ -217,7 +218,7 @@ def test_an_excursion_limit_lowers_the_rated_power_until_it_is_kept():
 def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("verdict") / "out"
     rating = AmplifierRating(ohm=8.0, sine_watt=2.0, volts_per_unit=10.0)
-    verdict = assess(noise(), arriving(20), SECONDARY, rating=rating, fs=FS, n_taps=TAPS, pascal_per_unit=1.0)
+    verdict = assess(noise(), PLANT, rating=rating, n_taps=TAPS, pascal_per_unit=1.0)
     return verdict, verdict.write(folder)
 
 
@@ -268,8 +269,8 @@ def test_the_page_says_where_it_comes_from_and_no_watts_that_are_not_known(tmp_p
     ],
 )
 def test_a_controller_that_did_better_is_chosen_or_the_verdict_says_why_not(rating, algorithm, other, why):
-    options: dict = {"fs": FS, "n_taps": TAPS, "beside": (other,), "want_db": 0.0}
-    verdict = assess(noise(), arriving(20), arriving(6, length=16), rating=rating, algorithm=algorithm, **options)
+    options: dict = {"n_taps": TAPS, "beside": (other,), "want_db": 0.0}
+    verdict = assess(noise(), PLANT, rating=rating, algorithm=algorithm, **options)
     reached = {name: figures["noise_reduction_db"] for name, figures in verdict.figures.items()}
     assert reached[other] > reached[algorithm] + 0.1
     assert any(note.startswith(f"{other}, as published, reaches {reached[other]:.1f} {why}") for note in verdict.notes)
@@ -310,12 +311,12 @@ def test_a_third_octave_that_the_control_makes_louder_is_noted():
         ({"noise": np.ones(8000)}, "noise must not be silent"),
         ({"noise": np.full(8000, np.nan)}, "noise must be finite"),
         ({"secondary": np.zeros(8)}, "secondary must not be silent: every value is 0; record it again"),
-        ({"primary": None}, "primary must be given unless there is a disturbance"),
+        ({"primary": None}, "plant must have a primary path unless there is a disturbance"),
         ({"disturbance": noise()}, "channel 0 of disturbance is channel 0 of noise, sample for sample"),
         ({"disturbance": np.ones(7)}, "disturbance must have 24000 values, got 7"),
         (
             {"noise": noise()[:16000].reshape(2, 8000)},
-            "primary must be (K microphones, I references, taps) = (1, 2, taps)",
+            "noise must have the 1 channel(s) of the plant's primary path, got 2",
         ),
         ({"noise": Recording(noise(), 2 * FS)}, f"noise is sampled at {2 * FS} Hz but fs is {FS} Hz"),
         ({"rating": 0.0}, "rating must be greater than 0"),
@@ -329,6 +330,6 @@ def test_a_third_octave_that_the_control_makes_louder_is_noted():
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
 def test_bad_input_is_refused(change, message):
-    good = {"noise": noise(), "primary": arriving(20), "secondary": SECONDARY, "rating": 1.0, "n_taps": 16}
+    good = {"noise": noise(), "primary": arriving(20), "secondary": SECONDARY, "rating": 1.0, "n_taps": 16} | change
     with pytest.raises(ValueError, match=re.escape(message)):
-        assess(fs=FS, **good | change)
+        assess(plant=Plant(good.pop("secondary"), good.pop("primary"), fs=FS), **good)

@@ -12,7 +12,7 @@ import pytest
 import soundfile
 from scipy.signal import lfilter
 
-from kfopc_filterpy import noise_reduction_db
+from kfopc_filterpy import Plant, noise_reduction_db
 from kfopc_filterpy.bounds import predictor_reference
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import internal_model_margin
@@ -51,8 +51,8 @@ def heard(other_db: float) -> np.ndarray:
 
 
 def on(x=None, primary=PRIMARY, secondary=APART, **options):
-    options = {"rating": PLENTY, "fs": FS, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None} | options
-    return assess(noise() if x is None else x, primary, secondary, **options)
+    options = {"rating": PLENTY, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None} | options
+    return assess(noise() if x is None else x, Plant(secondary, primary, fs=FS), **options)
 
 
 # ---- Against one channel
@@ -79,7 +79,7 @@ def test_two_loudspeakers_that_do_not_meet_have_the_ceilings_and_the_powers_of_o
     np.testing.assert_allclose(two.unlimited_power, 2 * [one.unlimited_power], rtol=1e-3)
     np.testing.assert_allclose(two.required_rated_power, 2 * [one.required_rated_power], rtol=1e-3)
     assert two.band.low_hz == pytest.approx(one.band.low_hz)
-    assert two.settings.settings == pytest.approx(one.settings.settings, rel=1e-3)
+    assert two.settings.noises == pytest.approx(one.settings.noises, rel=1e-3)
 
 
 def test_the_order_of_the_loudspeakers_is_that_of_their_powers():
@@ -115,7 +115,7 @@ def test_feedback_is_a_reference_that_is_the_disturbance_a_sample_late(n_microph
     several = heard_before or n_microphones > 1
     assert feedback.channels == ((int(heard_before), n_microphones, n_microphones) if several else None)
     weights = feedback.runs["KF-PB"].weights[-1]
-    margin = internal_model_margin(weights, secondary if several else secondary[0, 0], fs=FS)
+    margin = internal_model_margin(weights, Plant(secondary if several else secondary[0, 0], fs=FS))
     assert feedback.loop == margin
     assert forward.loop is None
     assert margin.stable
@@ -243,7 +243,10 @@ AMPLIFIER, CONE = AmplifierRating(ohm=8.0, sine_watt=1.0), LoudspeakerRating(ohm
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"primary": PRIMARY[:1]}, "primary must be (K microphones, I references, taps) = (2, 1, taps)"),
+        (
+            {"primary": PRIMARY[:1]},
+            "primary must be (K microphones, I references, taps) with the 2 microphones of secondary, got (1, 1, 64)",
+        ),
         ({"disturbance": noise()}, "disturbance must have a channel for each of the 2 microphones"),
         ({"secondary": APART[0]}, "secondary must have shape (K microphones, J loudspeakers, taps)"),
         ({"secondary": APART * [[[1.0]], [[0.0]]]}, "secondary[1] must not be silent"),

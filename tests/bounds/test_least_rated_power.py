@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import scipy.signal
-from helpers.channels import random_paths, through
+from helpers.channels import random_paths
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kfopc_filterpy import power_constrained_wiener
+from kfopc_filterpy import Plant, power_constrained_wiener
 from kfopc_filterpy.bounds import budgeted_rated_power, required_rated_power
 from kfopc_filterpy.bounds.wiener import wiener_solution
 
@@ -28,8 +28,8 @@ def test_scaled_filter_reaches_the_reduction_at_that_power():
     rng = np.random.default_rng(0)
     x = rng.standard_normal(20_000)
     s = np.array([0.0, 0.7, 0.4])
-    d = scipy.signal.lfilter([0, 0, 1.0, -0.4, 0.2], 1.0, x)
-    best = wiener_solution(x, d, s, 16)
+    plant = Plant(s, [0, 0, 1.0, -0.4, 0.2], fs=FS)
+    best, d = wiener_solution(x, plant, n_taps=16), plant.disturbance(x)
     needed = required_rated_power([3.0, 6.0, 10.0], **{name: getattr(best, name) for name in POWERS})
     start = 16 + 3 - 2
     for wanted, factor, power in zip([3.0, 6.0, 10.0], needed.constraint_factor, needed.rated_power, strict=True):
@@ -66,17 +66,14 @@ def test_refuses(wanted, changes, message):
 # ---- Several loudspeakers
 
 FS, TAPS, K, J = 1000.0, 8, 3, 2
-SECONDARY = random_paths(K, J, 7, seed=0)
-
-
-def signals(n_samples=2500):
-    rng = np.random.default_rng(2)
-    x = np.array([np.convolve(row, [1.0, 0.7], "same") for row in rng.standard_normal((2, n_samples))])
-    return x, through(random_paths(K, 2, 12, seed=1, delay=3), x) + 0.1 * rng.standard_normal((K, n_samples))
+PLANT = Plant(random_paths(K, J, 7, seed=0), random_paths(K, 2, 12, seed=1, delay=3), fs=FS)
+RNG = np.random.default_rng(2)
+X = np.array([np.convolve(row, [1.0, 0.7], "same") for row in RNG.standard_normal((2, 2500))])
+D = PLANT.disturbance(X) + 0.1 * RNG.standard_normal((K, 2500))
 
 
 def bound(rated_power):
-    return power_constrained_wiener(*signals(), SECONDARY, TAPS, rated_power, fs=FS)
+    return power_constrained_wiener(X, PLANT, n_taps=TAPS, rated_power=rated_power, disturbance=D)
 
 
 def test_scaled_filters_of_several_loudspeakers_reach_the_reduction_at_those_powers():
@@ -100,7 +97,7 @@ def test_scaled_filters_of_several_loudspeakers_reach_the_reduction_at_those_pow
 def test_a_budget_of_that_power_reaches_the_reduction_and_less_does_not(proportions):
     most = bound(1e6).unconstrained.noise_reduction_db
     wanted = np.array([[1e-3, 0.3 * most], [0.6 * most, 0.95 * most]])
-    needed = budgeted_rated_power(wanted, *signals(), SECONDARY, TAPS, fs=FS, proportions=proportions)
+    needed = budgeted_rated_power(wanted, X, PLANT, n_taps=TAPS, disturbance=D, proportions=proportions)
     assert needed.rated_power.shape == needed.control_power.shape == needed.penalty.shape == (2, 2, J)
     np.testing.assert_allclose(needed.rated_power[..., 1] / needed.rated_power[..., 0], (proportions or [1, 1])[1])
     for index in np.ndindex(2, 2):
@@ -113,10 +110,10 @@ def test_a_budget_of_that_power_reaches_the_reduction_and_less_does_not(proporti
 
 
 def test_a_budget_for_one_channel_is_the_single_channel_bounds():
-    x, d = signals()
-    needed = budgeted_rated_power(1.0, x[0], d[0], SECONDARY[0, 0], TAPS, fs=FS)
+    one_path, given = Plant(PLANT.secondary[0, 0], fs=FS), {"n_taps": TAPS, "disturbance": D[0]}
+    needed = budgeted_rated_power(1.0, X[0], one_path, **given)
     assert needed.rated_power.shape == needed.penalty.shape == ()
-    one = power_constrained_wiener(x[0], d[0], SECONDARY[0, 0], TAPS, float(needed.rated_power), fs=FS).whole
+    one = power_constrained_wiener(X[0], one_path, rated_power=float(needed.rated_power), **given).whole
     assert one.noise_reduction_db == pytest.approx(1.0, abs=1e-3)
     assert one.penalty == pytest.approx(float(needed.penalty), rel=1e-3)
 
@@ -124,7 +121,7 @@ def test_a_budget_for_one_channel_is_the_single_channel_bounds():
 def test_the_limits_of_a_budget():
     free = bound(1e6).unconstrained
     most = free.noise_reduction_db
-    needed = budgeted_rated_power([0.0, most, most + 1.0], *signals(), SECONDARY, TAPS, fs=FS, beyond="inf")
+    needed = budgeted_rated_power([0.0, most, most + 1.0], X, PLANT, n_taps=TAPS, disturbance=D, beyond="inf")
     assert needed.rated_power[0].tolist() == [0.0, 0.0]
     assert needed.rated_power[1].max() == pytest.approx(free.control_power.max(), rel=0.01)  # no rating binds
     assert np.isinf(needed.rated_power[2]).all()
@@ -137,14 +134,17 @@ def test_the_limits_of_a_budget():
         ({"noise_reduction_db": 90.0}, "must not exceed what unlimited power attains, .* dB, got 90 dB; use longer"),
         ({"proportions": [1.0, 2.0, 3.0]}, "proportions must be one number or one for each of the 2 loudspeakers"),
         ({"beyond": "nan"}, "beyond must be one of"),
+        (
+            {"plant": PLANT.changed_at(1.0, amplifier=np.tanh)},
+            "budgeted_rated_power needs a plant that does not change",
+        ),
     ],
-    ids=["far", "three", "beyond"],
+    ids=["far", "three", "beyond", "a changing plant"],
 )
 def test_a_budget_that_cannot_be_is_refused(changed, message):
-    x, d = signals()
-    settings = {"noise_reduction_db": 1.0, "reference": x, "disturbance": d, "secondary_path": SECONDARY} | changed
+    settings = {"noise_reduction_db": 1.0, "plant": PLANT, "disturbance": D} | changed
     with pytest.raises(ValueError, match=message):
-        budgeted_rated_power(**settings, n_taps=TAPS, fs=FS)
+        budgeted_rated_power(reference=X, n_taps=TAPS, **settings)
 
 
 def test_powers_of_loudspeakers_that_cannot_be_are_refused():
