@@ -18,6 +18,8 @@ import numpy as np
 import pooch
 from scipy.io import loadmat
 
+from kfopc_filterpy import Plant
+
 FOLDER = "KFOPC_DATA"
 HOST = "https://raw.githubusercontent.com"
 TIMEOUT_S = 5.0  # for the network's next answer; each file is tried once
@@ -78,31 +80,23 @@ class MeasuredDuct:
     fs: float = FS
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredRoom:
-    """Taps of a room's primary paths, (K, I, n_taps), and secondary paths, (K, J, n_taps), at the rate `fs` in Hz."""
-
-    primary: np.ndarray
-    secondary: np.ndarray
-    fs: float = FS
-
-
 def load_measured_duct(noise: str) -> MeasuredDuct:
     """Return the measured duct, and the recording of the "motor" (10.1 s) or of the "compressor" (17.5 s)."""
     file, variable = {"motor": ("Motor.mat", "Motor_noise"), "compressor": ("compressor_16kHz.mat", "yr")}[noise]
     return MeasuredDuct(_read("duct/Pz1.mat", "Pz1"), _read("duct/Sz.mat", "S"), _read(f"{noise}/{file}", variable))
 
 
-def load_measured_room() -> MeasuredRoom:
-    """Return the paths from one noise source and four loudspeakers to four microphones.
+def load_measured_room() -> Plant:
+    """Return the plant of one noise source and four loudspeakers to four microphones.
 
     The source does not say which index of a secondary path is the loudspeaker: S{k}{j} is read as the path from
     loudspeaker j to microphone k.
     """
     each = range(1, 5)
-    return MeasuredRoom(
-        primary=np.array([[_read(f"room4x4/P{k}.mat", f"P{k}")] for k in each]),
-        secondary=np.array([[_read(f"room4x4/S{k}{j}.mat", f"S{k}{j}") for j in each] for k in each]),
+    return Plant(
+        [[_read(f"room4x4/S{k}{j}.mat", f"S{k}{j}") for j in each] for k in each],
+        [[_read(f"room4x4/P{k}.mat", f"P{k}")] for k in each],
+        fs=FS,
     )
 
 

@@ -51,9 +51,7 @@ MERITS: dict[str, Merit] = {
     "noise_reduction_db": Merit(
         "noise reduction (dB)",
         "energy of the disturbance over that of the error",
-        lambda results, scene, tone_hz: float(
-            np.mean([metrics.noise_reduction_db(r.error, r.disturbance) for r in results])
-        ),
+        lambda results, scene, tone_hz: float(np.mean([r.noise_reduction_db for r in results])),
     ),
     "output_power": Merit(
         "output power",
@@ -81,7 +79,8 @@ MERITS: dict[str, Merit] = {
     ),
     "diverged_at_s": Merit(
         "diverged (s)",
-        "time at which the control signal passed a million times the rated amplitude, and the run was stopped",
+        "time at which the control signal passed a million times the root of the controller's rated power, 1 if it has "
+        "none, and the run was stopped",
         lambda results, scene, tone_hz: min(
             (r.diverged_at_s for r in results if r.diverged_at_s is not None), default=None
         ),
@@ -113,9 +112,10 @@ def figures_of_merit(results: Results, scene: Scene, *, tone_hz: float | None = 
     Examples
     --------
     >>> from comparisons.bench import figures_of_merit, make_controller, make_scene
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.signals import tone
-    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
-    ...                    power_multiple=2.0, n_taps=8)
+    >>> plant = Plant([0, 1.0], [0, 0, 1.0], fs=8000)
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, plant, rated_power=1.0, power_multiple=2.0, n_taps=8)
     >>> figures = figures_of_merit([scene.run(make_controller(scene, "KF-OPC", 1e-6))], scene)
     >>> round(figures["output_power"], 2)
     1.0

@@ -12,7 +12,7 @@ import numpy as np
 
 from kfopc_filterpy import OutputPowerConstraint
 from kfopc_filterpy.controllers import Controller, penalty_factor
-from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
+from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.controllers.table import CORE, MAKERS
 from kfopc_filterpy.power.amplifiers import Amplifier
 from kfopc_filterpy.verdict.candidates import DIAGONAL_STATE_NOISES, FORGOTTEN, STEP_SIZES
@@ -39,7 +39,7 @@ class Algorithm:
     Parameters
     ----------
     make : callable
-        Controller's class, or a function that makes one: of the number of taps, the secondary path and keyword arguments.
+        Function that makes a controller: of the number of taps, the secondary path and keyword arguments.
     settings : callable
         Function of a scene, the first setting in the scene's units, and the second setting, which returns these keyword
         arguments; those that all algorithms share are left out.
@@ -237,8 +237,8 @@ REGISTRY: dict[str, Algorithm] = {
     "FxNLMS": _made_by("FxNLMS", _normalised, **_STEP, **_FREE, **_CHANNELS),
     "leaky FxLMS": _made_by("leaky FxLMS", _leak, **_LEAK, **_CHANNELS),
     "optimal leaky FxLMS": _made_by("optimal leaky FxLMS", _constrained(_step), **_STEP, **_KNOWS, **_CHANNELS),
-    "MOV-FxLMS fixed": _made_by("MOV-FxLMS", _constrained(_penalty), **_PENALTY, **_KNOWS, **_CHANNELS),
-    "MOV-FxLMS by variance": _made_by("MOV-FxLMS", _constrained(_penalty_by_variance), **_STEP, **_KNOWS),
+    "MOV-FxLMS fixed": _made_by("MOV-FxLMS", _penalty, **_PENALTY, **_KNOWS, **_CHANNELS),
+    "MOV-FxLMS by variance": _made_by("MOV-FxLMS", _penalty_by_variance, **_STEP, **_KNOWS),
     "MOV-FxLMS": _made_by("MOV-FxLMS", _constrained(_step), of_paper=True, **_STEP, **_KNOWS, **_CHANNELS),
     "MOV-MFxLMS": _made_by("MOV-MFxLMS", _constrained(_step), **_STEP, **_KNOWS, **_CHANNELS),
     "two-gradient FxLMS": _made_by("two-gradient FxLMS", _two_gradients, **_PEAK, **_CHANNELS),
@@ -314,9 +314,10 @@ def make_controller(
     Examples
     --------
     >>> from comparisons.bench import make_controller, make_scene
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.signals import tone
-    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
-    ...                    power_multiple=2.0, n_taps=8)
+    >>> plant = Plant([0, 1.0], [0, 0, 1.0], fs=8000)
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, plant, rated_power=1.0, power_multiple=2.0, n_taps=8)
     >>> make_controller(scene, "KF-OPC", 1e-6).rated_power
     1.0
     """
@@ -331,5 +332,5 @@ def make_controller(
     if several:
         settings["n_references"] = len(scene.references[0])
     controller: Any = own.make(scene.n_taps, scene.known_secondary, **settings)
-    controller.name = algorithm  # the registry tells apart what one class does with different settings
+    controller.name = algorithm  # the registry tells apart what one algorithm does with different settings
     return controller

@@ -12,20 +12,17 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, SimulationResult, simulate, simulate_scenarios
-from kfopc_filterpy._types import Counter, NumberOrArray, PathModels
-from kfopc_filterpy._validate import as_channels, as_positive, as_signal, per_loudspeaker
+from kfopc_filterpy import HardClipAmplifier, Plant, SimulationResult, simulate
+from kfopc_filterpy._types import Counter, NumberOrArray
+from kfopc_filterpy._validate import as_positive, per_loudspeaker
 from kfopc_filterpy.bounds import (
     WienerSolution,
     measurement_noise_from_run,
     power_constrained_solution,
     wiener_solution,
 )
-from kfopc_filterpy.bounds.channel_bound import full_channel_stretch
-from kfopc_filterpy.controllers import Controller, CoreController
-from kfopc_filterpy.loop.inputs import channel_disturbances
-from kfopc_filterpy.paths import path_taps
-from kfopc_filterpy.paths.path_matrix import is_path_matrix, secondary_paths
+from kfopc_filterpy.bounds.channel_bound import channel_record
+from kfopc_filterpy.controllers import Controller
 from kfopc_filterpy.power.amplifiers import Amplifier
 from kfopc_filterpy.verdict.candidates import filtered_power
 from kfopc_filterpy.verdict.runs import one_blas_thread
@@ -89,9 +86,9 @@ class Scene:
     Parameters
     ----------
     fs : float
-        Sampling frequency in Hz.
+        Sample rate in Hz.
     secondary : ndarray, shape (n_path_taps,) or (K, J, n_path_taps)
-        True secondary path.
+        True secondary path; one of one channel has no channel axes.
     references, disturbances : list of ndarray, shape (n_samples,), or (I, n_samples) and (K, n_samples)
         One for each seed.
     rated_power : float or ndarray, shape (J,)
@@ -181,38 +178,48 @@ class Scene:
         """Power gain G_s of the known secondary path for the reference (eq. 11)."""
         return self.filtered_power / _power(self.references[0])
 
+    @property
+    def plant(self) -> Plant:
+        """Plant of the runs, whose disturbances are those of the scene."""
+        return Plant(self.secondary, amplifier=self.amplifier, fs=self.fs, sensor_noise_std=self.sensor_noise_std)
+
+    def plant_of(self, controller: Controller) -> Plant:
+        """Return the plant that a controller is run on; here the same for all."""
+        return self.plant
+
     def run(self, controller: Controller, seed_index: int = 0, **options: Any) -> SimulationResult:
         """Run a `controller` on the noise of one seed, of index `seed_index`; `options` go to `simulate`."""
-        return simulate(controller, self.references[seed_index], **self._options(seed_index) | options)
+        return self.run_together([controller], seed_index, **options)[0]
 
     def run_together(
-        self, controllers: Sequence[CoreController], seed_index: int = 0, **options: Any
+        self,
+        controllers: Sequence[Controller],
+        seed_index: int = 0,
+        plants: Sequence[Plant] | None = None,
+        **options: Any,
     ) -> list[SimulationResult]:
-        """Run `controllers` that share their gains on the noise of one seed, of index `seed_index`.
-
-        `options` go to `simulate_scenarios`.
-        """
-        return simulate_scenarios(controllers, self.references[seed_index], **self._options(seed_index) | options)
-
-    def _options(self, seed_index: int) -> dict[str, Any]:
-        names = ("fs", "rated_power", "amplifier", "sensor_noise_std", "switch_on_s")
-        own = {"disturbance": self.disturbances[seed_index], "rng": self.sensor_noise_seeds[seed_index]}
-        return {**own, "secondary_path": self.secondary, **{name: getattr(self, name) for name in names}}
+        """Run `controllers` like `run`, at the cost of one filter if they share their gains; `plants` has other plants."""
+        return simulate(
+            list(controllers),
+            self.references[seed_index],
+            [self.plant_of(controller) for controller in controllers] if plants is None else plants,
+            disturbance=self.disturbances[seed_index],
+            switch_on_s=self.switch_on_s,
+            rng=self.sensor_noise_seeds[seed_index],
+            **options,
+        )
 
 
 def make_scene(
     references: Mapping[int, np.ndarray],
-    primary: PathModels,
-    secondary: PathModels,
+    plant: Plant,
     *,
-    fs: float,
     rated_power: float,
     power_multiple: float,
     n_taps: int,
     switch_on_s: float = 0.5,
     sensor_noise_db: float = -60.0,
     nse_window_s: float = 0.005,
-    amplifier: Amplifier | None = None,
 ) -> Scene:
     """Return a scene whose noises need a multiple of the rated power.
 
@@ -226,10 +233,8 @@ def make_scene(
     ----------
     references : mapping of int to ndarray, shape (n_samples,) or (I, n_samples)
         Noise for each seed.
-    primary, secondary : array_like or control.LTI
-        Primary and secondary path: taps, or a python-control system. With several channels (K, I, n) and (K, J, n).
-    fs : float
-        Sampling frequency in Hz.
+    plant : Plant
+        Plant with a primary path; its sensor noise is replaced by that of `sensor_noise_db`.
     rated_power : float or ndarray, shape (J,)
         Rated output power, a mean square; of all loudspeakers or of each.
     power_multiple : float
@@ -242,8 +247,6 @@ def make_scene(
         Power of the sensor noise over that of the disturbance in dB.
     nse_window_s : float, default 0.005
         Window of the normalised squared error in seconds.
-    amplifier : amplifier, optional
-        Amplifier; linear by default.
 
     Returns
     -------
@@ -253,36 +256,36 @@ def make_scene(
     Raises
     ------
     ValueError, TypeError
-        A rated power that is not positive, a noise that is not longer than `switch_on_s`, or paths and references whose
-        numbers of channels do not fit.
+        A rated power that is not positive, a noise that is not longer than `switch_on_s`, or one whose channels are not
+        those of the plant.
 
     Examples
     --------
     >>> from comparisons.bench import make_scene
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.signals import tone
-    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
-    ...                    power_multiple=2.0, n_taps=8)
+    >>> plant = Plant([0, 1.0], [0, 0, 1.0], fs=8000)
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, plant, rated_power=1.0, power_multiple=2.0, n_taps=8)
     >>> round(float((scene.references[0] ** 2).mean()), 3)  # the path has a gain of 1
     2.0
     """
-    s = secondary_paths(secondary, fs=fs)[0] if is_path_matrix(secondary) else path_taps(secondary, fs=fs)
-    rated_power = _as_rating(rated_power, s)
-    signals = {seed: _as_reference(x, switch_on_s, fs, s) for seed, x in references.items()}
+    signals = {seed: _as_reference(x, switch_on_s, plant) for seed, x in references.items()}
     first = next(iter(signals.values()))
-    settled = (..., slice(int(switch_on_s * fs), None))  # after the start-up of the primary path
-    d = _heard(first, primary, s, fs)
-    wiener = reachable_solution(first[settled], d[settled], s, n_taps, fs)
+    several = first.ndim == 2
+    rated_power = _as_rating(rated_power, plant if several else None)
+    settled = (..., slice(int(switch_on_s * plant.fs), None))  # after the start-up of the primary path
+    wiener = reachable_solution(first[settled], plant.disturbance(first)[settled], plant, n_taps)
     asked = power_multiple * np.sum(rated_power * np.ones(np.shape(wiener.control_power)))
     share = wiener.control_power / np.sum(wiener.control_power)
     power = _power(first) * asked / np.sum(wiener.control_power)
     scaled = [np.sqrt(power / _power(x)) * x for x in signals.values()]
-    disturbances = [_heard(x, primary, s, fs) for x in scaled]
+    disturbances = [plant.disturbance(x) for x in scaled]
     std = float(np.sqrt(np.mean(disturbances[0][settled] ** 2)) * 10 ** (sensor_noise_db / 20))
     recorded = disturbances[0][settled]
     recorded = recorded + std * np.random.default_rng(0).standard_normal(recorded.shape)
     return Scene(
-        fs=fs,
-        secondary=s,
+        fs=plant.fs,
+        secondary=plant.secondary if several else plant.secondary[0, 0],
         references=scaled,
         disturbances=disturbances,
         rated_power=rated_power,
@@ -290,8 +293,8 @@ def make_scene(
         sensor_noise_std=std,
         switch_on_s=switch_on_s,
         nse_window_s=nse_window_s,
-        amplifier=amplifier,
-        measurement_noise=_unexplained(scaled[0][settled], recorded, s, n_taps, fs),
+        amplifier=plant.amplifiers if several else plant.amplifiers[0],
+        measurement_noise=_unexplained(scaled[0][settled], recorded, plant, n_taps),
         initial_variance=float(asked / (n_taps * power * np.size(share))),
         unconstrained_power=asked * share,
         wiener_noise_reduction_db=wiener.noise_reduction_db,
@@ -319,21 +322,23 @@ def with_clipping(scene: Scene) -> Scene:
     Examples
     --------
     >>> from comparisons.bench import make_scene, with_clipping
+    >>> from kfopc_filterpy import Plant
     >>> x = np.random.default_rng(0).standard_normal(8000)
-    >>> scene = make_scene({0: x}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=0.5, power_multiple=4.0, n_taps=8)
+    >>> plant = Plant([0, 1.0], [0, 0, 1.0], fs=8000)
+    >>> scene = make_scene({0: x}, plant, rated_power=0.5, power_multiple=4.0, n_taps=8)
     >>> clipped = with_clipping(scene)
     >>> clipped.amplifier.limit, bool(clipped.measurement_noise > 100 * scene.measurement_noise)
     (1.0, True)
     """
     amplifier = HardClipAmplifier(scene.amplitude_limit)
-    x, d = scene.settled
+    (x, d), n_taps = scene.settled, scene.n_taps
     with reachable_weights():
-        bound = power_constrained_solution(x, d, scene.secondary, scene.n_taps, scene.rated_power)
+        bound = power_constrained_solution(x, scene.plant, n_taps=n_taps, rated_power=scene.rated_power, disturbance=d)
     y = np.convolve(x, bound.weights)[: x.size]
     lost = np.convolve(y - amplifier(y), scene.secondary)[: x.size]
     q = scene.measurement_noise
     if np.any(lost):  # else the rating is ample
-        q += _unexplained(x, lost, scene.secondary, scene.n_taps, scene.fs)
+        q += _unexplained(x, lost, scene.plant, n_taps)
     return replace(scene, amplifier=amplifier, measurement_noise=q)
 
 
@@ -349,19 +354,21 @@ def louder(scene: Scene, gain: float) -> Scene:
     )
 
 
-def _as_rating(rated_power: Any, s: np.ndarray) -> Any:
-    """Return a rated power, or one for each loudspeaker if several are given."""
-    if s.ndim == 1 or np.ndim(rated_power) == 0:
+def _as_rating(rated_power: Any, plant: Plant | None) -> Any:
+    """Return a rated power, or one for each loudspeaker of a plant if several are given."""
+    if plant is None or np.ndim(rated_power) == 0:
         return as_positive(rated_power, "rated_power")
-    return per_loudspeaker(rated_power, s.shape[1], "rated_power")
+    return per_loudspeaker(rated_power, plant.n_loudspeakers, "rated_power")
 
 
-def _as_reference(x: Any, switch_on_s: float, fs: float, s: np.ndarray) -> np.ndarray:
+def _as_reference(x: Any, switch_on_s: float, plant: Plant) -> np.ndarray:
     """Return a noise as (n_samples,), or as (I, n_samples) with several channels."""
-    x = as_signal(x, "references") if s.ndim == 1 else np.atleast_2d(as_channels(x, "references"))
-    if x.shape[-1] <= int(switch_on_s * fs):
-        raise ValueError(f"references must be longer than switch_on_s = {switch_on_s:g} s, got {x.shape[-1] / fs:g} s")
-    return x
+    x = plant.references(x)
+    if x.shape[1] <= int(switch_on_s * plant.fs):
+        raise ValueError(
+            f"references must be longer than switch_on_s = {switch_on_s:g} s, got {x.shape[1] / plant.fs:g} s"
+        )
+    return x[0] if plant.has_one_channel(x) else x
 
 
 def _power(x: np.ndarray) -> float:
@@ -369,28 +376,21 @@ def _power(x: np.ndarray) -> float:
     return float(np.mean(x**2, axis=-1).sum())
 
 
-def _heard(x: np.ndarray, primary: Any, s: np.ndarray, fs: float) -> np.ndarray:
-    """Return the disturbance of a reference, or of several."""
-    if s.ndim == 1:
-        return np.convolve(x, path_taps(primary, fs=fs))[: x.size]
-    return channel_disturbances(x, primary, None, fs, len(s))
-
-
-def reachable_solution(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> WienerSolution:
+def reachable_solution(x: np.ndarray, d: np.ndarray, plant: Plant, n_taps: int) -> WienerSolution:
     """Return the unconstrained Wiener solution whose weights a controller can reach."""
-    if s.ndim == 1:
+    if x.ndim == 1:
         with reachable_weights():
-            return wiener_solution(x, d, s, n_taps)
-    record = full_channel_stretch(x, d, s, n_taps, fs)
+            return wiener_solution(x, plant, n_taps=n_taps, disturbance=d)
+    record = channel_record(x, d, plant.secondary, n_taps).full(plant.secondary.shape[2])
     return record.solution(record.correlations().weights(ridge=CHANNEL_RIDGE * record.filtered_power))
 
 
-def _unexplained(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> float:
+def _unexplained(x: np.ndarray, d: np.ndarray, plant: Plant, n_taps: int) -> float:
     """Return q, the power that no control filter explains (eq. 7), per microphone."""
-    if s.ndim == 1:
+    if x.ndim == 1:
         with reachable_weights():
-            return measurement_noise_from_run(x, d, s, n_taps)
-    return float(reachable_solution(x, d, s, n_taps, fs).error_power)
+            return measurement_noise_from_run(x, plant, n_taps=n_taps, disturbance=d)
+    return float(reachable_solution(x, d, plant, n_taps).error_power)
 
 
 @contextmanager

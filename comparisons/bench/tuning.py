@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db, output_power
+from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.controllers import Controller
 from kfopc_filterpy.verdict.runs import AllDivergedError
 
@@ -108,9 +108,10 @@ def run_setting(
     Examples
     --------
     >>> from comparisons.bench import make_scene, run_setting
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.signals import tone
-    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
-    ...                    power_multiple=2.0, n_taps=8)
+    >>> plant = Plant([0, 1.0], [0, 0, 1.0], fs=8000)
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, plant, rated_power=1.0, power_multiple=2.0, n_taps=8)
     >>> run_setting(scene, "KF-OPC", 1e-6).algorithm
     'KF-OPC'
     """
@@ -156,9 +157,10 @@ def run_settings(
     Examples
     --------
     >>> from comparisons.bench import Runs, make_scene, run_settings
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.signals import tone
-    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
-    ...                    power_multiple=2.0, n_taps=8)
+    >>> plant = Plant([0, 1.0], [0, 0, 1.0], fs=8000)
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, plant, rated_power=1.0, power_multiple=2.0, n_taps=8)
     >>> run_settings(Runs(), scene, [("KF-ANC", 1e-6, 0), ("KF-OPC", 1e-6, 0)], lambda result: result.algorithm)
     ['KF-ANC', 'KF-OPC']
     """
@@ -206,9 +208,10 @@ def try_settings(
     Examples
     --------
     >>> from comparisons.bench import Runs, make_scene, try_settings
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.signals import tone
-    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
-    ...                    power_multiple=2.0, n_taps=8)
+    >>> plant = Plant([0, 1.0], [0, 0, 1.0], fs=8000)
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, plant, rated_power=1.0, power_multiple=2.0, n_taps=8)
     >>> trials = try_settings(Runs(), scene, {"FxLMS": [0.01, 0.1, 50.0]})["FxLMS"]
     >>> [trial.diverged for trial in trials]
     [False, False, True]
@@ -219,9 +222,8 @@ def try_settings(
         if result is None or result.diverged_at_s is not None:
             return Trial(np.nan, np.inf, np.inf, 0.0 if result is None else result.diverged_at_s)
         # There is no NSE until the first sound has passed the primary path.
-        nse = np.nanmean(nse_db(result.error, result.disturbance, scene.fs, scene.nse_window_s))
-        reduction = noise_reduction_db(result.error, result.disturbance)
-        return Trial(np.nan, float(nse), output_power(result.control_signal), None, reduction)
+        nse = np.nanmean(result.nse_db(scene.nse_window_s))
+        return Trial(np.nan, float(nse), result.output_power, None, result.noise_reduction_db)
 
     outcomes = dict(zip(jobs, run_settings(runs, scene, jobs, measured, planned), strict=True))
     return {
@@ -259,9 +261,10 @@ def best_setting(scene: Scene, algorithm: str, trials: Sequence[Trial]) -> Tuned
     Examples
     --------
     >>> from comparisons.bench import Trial, best_setting, make_scene
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.signals import tone
-    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
-    ...                    power_multiple=2.0, n_taps=8)
+    >>> plant = Plant([0, 1.0], [0, 0, 1.0], fs=8000)
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, plant, rated_power=1.0, power_multiple=2.0, n_taps=8)
     >>> trials = [Trial(1e-6, -20.0, 1.5), Trial(1e-7, -15.0, 1.0)]
     >>> best_setting(scene, "KF-OPC", trials).setting, best_setting(scene, "KF-ANC", trials).setting
     (1e-07, 1e-06)
@@ -319,9 +322,10 @@ def tune(
     Examples
     --------
     >>> from comparisons.bench import Runs, make_scene, tune
+    >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.signals import tone
-    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
-    ...                    power_multiple=2.0, n_taps=8)
+    >>> plant = Plant([0, 1.0], [0, 0, 1.0], fs=8000)
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, plant, rated_power=1.0, power_multiple=2.0, n_taps=8)
     >>> best = tune(Runs(), scene, ["KF-PB"])["KF-PB"]
     >>> best.within_budget, len(best.trials)
     (True, 1)

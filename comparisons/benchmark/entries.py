@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from kfopc_filterpy import Plant
 from kfopc_filterpy.bounds import wiener_solution
 
 from ..bench import Algorithm, algorithms
@@ -35,7 +36,7 @@ class FilteredX(OneChannel):
 
     Parameters
     ----------
-    n_taps, secondary_path
+    n_taps, secondary
         As for the controllers of the package.
     adapt : callable
         Adapts the filter to the newest n_taps samples of x', the newest first, and to d^.
@@ -46,11 +47,11 @@ class FilteredX(OneChannel):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: np.ndarray,
+        secondary: np.ndarray,
         adapt: Callable[[np.ndarray, float], Any],
         weights: Callable[[], np.ndarray],
     ) -> None:
-        super().__init__(n_taps, secondary_path)
+        super().__init__(n_taps, secondary)
         self._adapt, self._weights = adapt, weights
 
     def control_signal(self, reference: float) -> float:
@@ -159,9 +160,8 @@ class AdafiltBlocks(PlaysBlocks):
 def _subfilters(task: Any, ratio: float, _: float) -> dict[str, Any]:
     """Design the sub-filters by white noise through the plant, as when a system is set up."""
     x = np.random.default_rng(0).standard_normal(round(DESIGN_S * task.fs))
-    design = wiener_solution(
-        x, np.convolve(task.primary, x)[: x.size], task.secondary, task.n_taps, regularization=DESIGN_RIDGE
-    )
+    plant = Plant(task.secondary, task.primary, fs=task.fs)
+    design = wiener_solution(x, plant, n_taps=task.n_taps, regularization=DESIGN_RIDGE)
     q = task.measurement_noise
     return {
         "subfilters": band_subfilters(design.weights),

@@ -9,23 +9,23 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, bandpass_path, power_constrained_wiener
+from kfopc_filterpy import Plant, bandpass_path, power_constrained_wiener
 from kfopc_filterpy._validate import as_choice
-from kfopc_filterpy.controllers import Controller, CoreController
-from kfopc_filterpy.paths import duct_paths, path_taps
+from kfopc_filterpy.controllers import Controller
+from kfopc_filterpy.paths import duct_plant
 from kfopc_filterpy.signals import band_limited_noise, compressor_noise, looped, tone
 
 from ..bench import Scene, make_scene
 from ..bench.scene import reachable_weights
-from ..studies.cases import Pair, measured_data, of_unit_gain
+from ..studies.cases import measured_data, of_unit_gain
 from ..studies.multichannel_rooms import built_in_room
 
 FOLDER = Path(__file__).resolve().parent / "tasks"
@@ -53,7 +53,7 @@ class Task(Scene):
         Hash of the definition; scores with the same one can be compared.
     block : int
         Samples of a block.
-    primary : ndarray
+    primary : ndarray, shape (K, I, n_taps)
         Primary path, for entries that are designed by a measurement of it.
     changed_at_s : float
         Time of the change of the plant; 0 if nothing changes.
@@ -69,21 +69,13 @@ class Task(Scene):
     changed_at_s: float = 0.0
     secondary_factor: float = 1.0
 
-    def run(self, controller: Controller, seed_index: int = 0, **options: Any) -> SimulationResult:
-        """Run a controller; one with `plays_blocks` delays its control signal itself."""
-        delay = self.block if getattr(controller, "plays_blocks", False) else 0
-        path: Any = self.secondary[..., delay:]
-        if self.secondary_factor != 1.0:
-            path = [(0.0, path), (self.changed_at_s, self.secondary_factor * path)]
-        return super().run(controller, seed_index, secondary_path=path, **options)
-
-    def run_together(
-        self, controllers: Sequence[CoreController], seed_index: int = 0, **options: Any
-    ) -> list[SimulationResult]:
-        """Run controllers that share their gains; one after the other if the secondary path changes."""
+    def plant_of(self, controller: Controller) -> Plant:
+        """Return the plant of a run; a controller with `plays_blocks` delays its control signal itself."""
+        path = self.secondary[..., self.block if getattr(controller, "plays_blocks", False) else 0 :]
+        plant = replace(self, secondary=path).plant
         if self.secondary_factor == 1.0:
-            return super().run_together(controllers, seed_index, **options)
-        return [self.run(controller, seed_index, **options) for controller in controllers]
+            return plant
+        return plant.changed_at(self.changed_at_s, secondary=self.secondary_factor * path)
 
     def bound_db(self) -> float:
         """Return the noise reduction of the best fixed filter within the rated power, over the half that counts."""
@@ -91,11 +83,10 @@ class Task(Scene):
         with reachable_weights():
             bound = power_constrained_wiener(
                 x,
-                d,
-                self.secondary_factor * self.secondary,
-                self.n_taps,
-                self.rated_power,
-                fs=self.fs,
+                Plant(self.secondary_factor * self.secondary, fs=self.fs),
+                n_taps=self.n_taps,
+                rated_power=self.rated_power,
+                disturbance=d,
                 switch_on_s=x.shape[-1] / self.fs / 2,
             ).whole
         left = np.mean(bound.error**2) + self.sensor_noise_std**2
@@ -126,21 +117,18 @@ def _measured() -> Any:
     return measured
 
 
-def _bandpass(fs: float, *, band_hz: list[float], primary_taps: int, secondary_taps: int) -> Pair:
+def _bandpass(fs: float, *, band_hz: list[float], primary_taps: int, secondary_taps: int) -> Plant:
     low, high = band_hz
-    return path_taps(bandpass_path(primary_taps, (low, high), fs=fs)), path_taps(
-        bandpass_path(secondary_taps, (low, high), fs=fs)
-    )
+    secondary, primary = (bandpass_path(n_taps, (low, high), fs=fs) for n_taps in (secondary_taps, primary_taps))
+    return Plant(secondary, primary)
 
 
-def _duct(fs: float) -> Pair:
-    duct = duct_paths(fs=fs)
-    return path_taps(duct.primary), path_taps(duct.secondary)
+def _duct(fs: float) -> Plant:
+    return duct_plant(fs=fs)
 
 
-def _room(fs: float, *, loudspeakers: int) -> Pair:
-    room = built_in_room(loudspeakers)
-    return room.primary, room.secondary
+def _room(fs: float, *, loudspeakers: int) -> Plant:
+    return built_in_room(loudspeakers).plant
 
 
 def _band(duration_s: float, *, fs: float, band_hz: list[float], rng: int) -> np.ndarray:
@@ -162,7 +150,7 @@ NOISES: dict[str, Callable[..., np.ndarray]] = {
     "tones": _tones,
     "recorded motor": _recording,
 }
-PATHS: dict[str, Callable[..., Pair]] = {
+PATHS: dict[str, Callable[..., Plant]] = {
     "band-pass": _bandpass,
     "duct": _duct,
     "room": _room,
@@ -212,17 +200,15 @@ def _task(
     change: Mapping[str, Any] | None = None,
     path_error: float | None = None,
 ) -> Task:
-    primary, secondary = _of_model(PATHS, paths, f"{path.name}, [paths]", fs=fs)
+    plant = _of_model(PATHS, paths, f"{path.name}, [paths]", fs=fs)
     own = {"duration_s": duration_s, "fs": fs}
     noises = {seed: _of_model(NOISES, noise, f"{path.name}, [noise]", rng=seed, **own) for seed in SEEDS}
     changed = _made(_change, change or {}, f"{path.name}, [change]")
-    _require_same_signals(path, signals_sha256, [primary, secondary, *noises.values()])
-    delayed = np.pad(secondary, [(0, 0)] * (secondary.ndim - 1) + [(block, 0)])
+    _require_same_signals(path, signals_sha256, [plant.primary, plant.secondary, *noises.values()])
+    delayed = np.pad(plant.secondary, ((0, 0), (0, 0), (block, 0)))
     scene = make_scene(
-        {seed: noise if secondary.ndim == 1 else np.atleast_2d(noise) for seed, noise in noises.items()},
-        primary,
-        delayed,
-        fs=fs,
+        noises,
+        Plant(delayed, plant.primary, fs=fs),
         rated_power=rated_power,
         power_multiple=needed_power,
         n_taps=n_taps,
@@ -238,7 +224,7 @@ def _task(
         title=title,
         digest=digest_of(path),
         block=block,
-        primary=primary,
+        primary=plant.primary,
         changed_at_s=changed["at_s"],
         secondary_factor=changed["secondary_factor"],
     )

@@ -21,8 +21,8 @@ class FastArrayKalman(OneChannel):
 
     name = "fast-array KF"
 
-    def __init__(self, n_taps: int, secondary_path: np.ndarray, *, forgetting: float, initial_variance: float) -> None:
-        super().__init__(n_taps, secondary_path)
+    def __init__(self, n_taps: int, secondary: np.ndarray, *, forgetting: float, initial_variance: float) -> None:
+        super().__init__(n_taps, secondary)
         self.lamda, self.root = forgetting, 1.0  # gamma^-1/2, gamma^-1 = 1 + x'^T P x' / lambda
         self.gain, self.first, self.second = np.zeros((3, n_taps + 1))  # [g gamma^-1/2; 0], and the columns of B
         self.first[0] = np.sqrt(initial_variance)

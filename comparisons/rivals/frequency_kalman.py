@@ -21,7 +21,7 @@ class FrequencyDomainKalman(OneChannel):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: np.ndarray,
+        secondary: np.ndarray,
         *,
         block_size: int,
         transition: float,
@@ -30,7 +30,7 @@ class FrequencyDomainKalman(OneChannel):
     ) -> None:
         self.B, self.A, self.forgetting = block_size, transition, forgetting
         self.size = (-(-n_taps // block_size) + 1) * block_size
-        super().__init__(n_taps, secondary_path, memory=self.size)
+        super().__init__(n_taps, secondary, memory=self.size)
         self.errors: list[float] = []
         self.blocks = 0
         self.P = np.full(self.size // 2 + 1, initial_variance)

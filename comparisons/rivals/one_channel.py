@@ -14,9 +14,9 @@ def push(line: np.ndarray, newest: Any) -> None:
 class OneChannel:
     """A control filter w with the newest samples of the reference, the filtered reference and the control signal."""
 
-    def __init__(self, n_taps: int, secondary_path: np.ndarray, memory: int = 0) -> None:
-        self.secondary_path, self.w = np.array(secondary_path, dtype=float), np.zeros(n_taps)
-        self.x, self.filtered, self.y = np.zeros((3, max(n_taps + 1, self.secondary_path.size, memory)))
+    def __init__(self, n_taps: int, secondary: np.ndarray, memory: int = 0) -> None:
+        self.secondary, self.w = np.array(secondary, dtype=float), np.zeros(n_taps)
+        self.x, self.filtered, self.y = np.zeros((3, max(n_taps + 1, self.secondary.size, memory)))
 
     def control_signal(self, reference: float) -> float:
         """Return the control signal for the newest reference sample."""
@@ -27,7 +27,7 @@ class OneChannel:
         """Take a sample of the reference."""
         push(self.x, reference)
         # x'(n) = (s^ * x)(n)
-        push(self.filtered, self.secondary_path @ self.x[: self.secondary_path.size])
+        push(self.filtered, self.secondary @ self.x[: self.secondary.size])
 
     def play(self) -> float:
         """Return the control signal."""
@@ -38,7 +38,7 @@ class OneChannel:
     def disturbance(self, error: float) -> float:
         """Return what the error reveals of the disturbance."""
         # d^(n) = e(n) + (s^ * y)(n)
-        return float(error + self.secondary_path @ self.y[: self.secondary_path.size])
+        return float(error + self.secondary @ self.y[: self.secondary.size])
 
     @property
     def weights(self) -> np.ndarray:

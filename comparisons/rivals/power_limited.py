@@ -26,7 +26,7 @@ class PowerLimitedFxLMS(OneChannel):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: np.ndarray,
+        secondary: np.ndarray,
         *,
         step_size: float,
         block_size: int,
@@ -35,7 +35,7 @@ class PowerLimitedFxLMS(OneChannel):
     ) -> None:
         self.mu, self.B, self.rated_power, self.forgetting = step_size, block_size, rated_power, forgetting
         self.size = (-(-n_taps // block_size) + 1) * block_size
-        super().__init__(n_taps, secondary_path, memory=self.size)
+        super().__init__(n_taps, secondary, memory=self.size)
         self.errors: list[float] = []
         self.blocks, self.price = 0, 0.0
         self.X2_filtered, self.X2 = np.zeros((2, self.size // 2 + 1))  # E|X'|^2, E|X|^2

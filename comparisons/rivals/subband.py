@@ -19,9 +19,9 @@ class SubbandFxLMS(OneChannel):
 
     name = "subband FxLMS"
 
-    def __init__(self, n_taps: int, secondary_path: np.ndarray, *, step_size: float, n_bands: int) -> None:
+    def __init__(self, n_taps: int, secondary: np.ndarray, *, step_size: float, n_bands: int) -> None:
         M = self.M = n_bands
-        super().__init__(n_taps, secondary_path, memory=4 * M)
+        super().__init__(n_taps, secondary, memory=4 * M)
         self.mu, self.n, self.e = step_size, 0, np.zeros(4 * M)
         # h, a low-pass filter of 4 M taps and the bandwidth fs/M
         self.h = np.hamming(4 * M) * np.sinc((np.arange(4 * M) - (4 * M - 1) / 2) / M)

@@ -33,7 +33,7 @@ class SubfilterKalman(OneChannel):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: np.ndarray,
+        secondary: np.ndarray,
         *,
         subfilters: np.ndarray,
         state_noise: float,
@@ -41,7 +41,7 @@ class SubfilterKalman(OneChannel):
         rated_power: float,
         fs: float,
     ) -> None:
-        super().__init__(n_taps, secondary_path)
+        super().__init__(n_taps, secondary)
         self.bank, self.r, self.q, self.rated_power = subfilters, state_noise, measurement_noise, rated_power
         C = len(subfilters)
         self.g, self.P = np.zeros(C), np.eye(C)

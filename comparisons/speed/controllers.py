@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import FrequencyDomainFxLMS, FxLMS, MOVFxLMS, kf_anc, kf_opc, kf_pb, simulate, simulate_scenarios
+from kfopc_filterpy import Plant, frequency_domain_fx_lms, fx_lms, kf_anc, kf_opc, kf_pb, mov_fx_lms, simulate
 from kfopc_filterpy.realtime import Supervisor
 
 from .estimator import random_walks, stepping
 from .timing import Work
 
 R, Q, P0 = 1e-8, 1.0, 1e-3
-SCENARIOS = 64
-PATH = np.random.default_rng(0).standard_normal(32) / 8  # secondary path of the closed loops
+SHARING = 64
+PLANT = Plant(np.random.default_rng(0).standard_normal(32) / 8, fs=16000)  # of the closed loops
 TARGET_FLOPS = 1e8  # of a turn
 TAPS = (16, 64, 128, 256, 512, 1024)
 
@@ -38,15 +38,15 @@ def noises(samples: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _kalman(make: Any, taps: int, **settings: Any) -> Any:
-    return make(taps, PATH, state_noise=R, measurement_noise=Q, initial_variance=P0, **settings)
+    return make(taps, PLANT, state_noise=R, measurement_noise=Q, initial_variance=P0, **settings)
 
 
 # KF-PB has so low a rated power that the price is always searched for.
 CONTROLLERS: dict[str, Callable[[int], Any]] = {
     "KF-ANC": lambda taps: _kalman(kf_anc, taps),
     "KF-OPC": lambda taps: _kalman(kf_opc, taps, rated_power=0.1),
-    "KF-PB": lambda taps: kf_pb(taps, PATH, rated_power=1e-6),
-    "MOV-FxLMS": lambda taps: MOVFxLMS(taps, PATH, step_size=1e-5, rated_power=0.1),
+    "KF-PB": lambda taps: kf_pb(taps, PLANT, rated_power=1e-6),
+    "MOV-FxLMS": lambda taps: mov_fx_lms(taps, PLANT, step_size=1e-5, rated_power=0.1),
 }
 
 
@@ -54,7 +54,7 @@ def simulated(name: str, taps: int) -> Work:
     """Return the work of a controller in `simulate`: amplifier, paths, power estimates, records."""
     samples = samples_for(taps, most=20000, least=2000)
     x, d = noises(samples)
-    return partial(simulate, CONTROLLERS[name](taps), x, disturbance=d, secondary_path=PATH), samples
+    return partial(simulate, CONTROLLERS[name](taps), x, PLANT, disturbance=d), samples
 
 
 def stepped(name: str, taps: int) -> Work:
@@ -71,11 +71,11 @@ def stepped(name: str, taps: int) -> Work:
 
 
 def together(taps: int) -> Work:
-    """Return the work of scenarios that share gains, in `simulate_scenarios`: the samples of all are counted."""
+    """Return the work of runs that share gains: the samples of all are counted."""
     samples = 16000 if taps <= 256 else 4000  # a second at 16 kHz
     x, d = noises(samples)
-    controllers = [_kalman(kf_opc, taps, rated_power=0.1 * (1 + i)) for i in range(SCENARIOS)]
-    return partial(simulate_scenarios, controllers, x, disturbance=d, secondary_path=PATH), SCENARIOS * samples
+    controllers = [_kalman(kf_opc, taps, rated_power=0.1 * (1 + i)) for i in range(SHARING)]
+    return partial(simulate, controllers, x, PLANT, disturbance=d), SHARING * samples
 
 
 def numpy_rank_one(taps: int) -> Work:
@@ -129,7 +129,7 @@ SAMPLES: dict[str, Callable[[int], Work]] = {
     "KFOPC.random_walk": lambda taps: stepping(*random_walks(taps)["np.float64"]),
     **{f"{name}, simulate": partial(simulated, name) for name in CONTROLLERS},
     **{f"{name}, stepped from Python": partial(stepped, name) for name in CONTROLLERS},
-    f"KF-OPC, each of {SCENARIOS} that share gains": together,
+    f"KF-OPC, each of {SHARING} that share gains": together,
     "filterpy": lambda taps: stepping(*random_walks(taps)["filterpy"]),
     "the O(L²) filter in numpy": numpy_rank_one,
     "padasip RLS": padasip,
@@ -141,12 +141,14 @@ SAMPLES: dict[str, Callable[[int], Work]] = {
 
 def _several(references: int, loudspeakers: int, microphones: int) -> Any:
     paths = np.random.default_rng(3).standard_normal((microphones, loudspeakers, 64)) * np.exp(-np.arange(64) / 10)
-    return kf_pb(128, paths, rated_power=1e-3, n_references=references)
+    return kf_pb(128, Plant(paths, fs=16000), rated_power=1e-3, n_references=references)
 
 
 BLOCK_CONTROLLERS: dict[str, Callable[[], Any]] = {
-    "FxLMS, 256 taps": lambda: FxLMS(256, PATH, step_size=1e-5),
-    "FxLMS, 256 taps, supervised": lambda: Supervisor(FxLMS(256, PATH, step_size=1e-5), amplitude_limit=10.0),
+    "FxLMS, 256 taps": lambda: fx_lms(256, PLANT, step_size=1e-5),
+    "FxLMS, 256 taps, supervised": lambda: Supervisor(
+        fx_lms(256, PLANT, step_size=1e-5), fs=16000, amplitude_limit=10.0
+    ),
     "KF-OPC, 256 taps": lambda: CONTROLLERS["KF-OPC"](256),
     "KF-PB, 256 taps": lambda: CONTROLLERS["KF-PB"](256),
     "KF-PB, 1 x 2 x 2, 128 taps": lambda: _several(1, 2, 2),
@@ -179,9 +181,9 @@ def processing(name: str, block: int) -> Callable[[], Any]:
 
 LONG_TAPS = (512, 1024, 2048, 4096, 8192, 16384)
 LONG_BLOCK = 512
-_blocks = partial(FrequencyDomainFxLMS, secondary_path=PATH, step_size=1e-6, block_size=LONG_BLOCK)
+_blocks = partial(frequency_domain_fx_lms, secondary=PLANT, step_size=1e-6, block_size=LONG_BLOCK)
 LONG: dict[str, Callable[[int], Any]] = {
-    "FxLMS": partial(FxLMS, secondary_path=PATH, step_size=1e-9),
+    "FxLMS": partial(fx_lms, secondary=PLANT, step_size=1e-9),
     "frequency-domain FxLMS": _blocks,
     "... with one partition": lambda taps: _blocks(taps, partition_size=taps),
     "... unconstrained": partial(_blocks, constrained=False),

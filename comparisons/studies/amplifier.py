@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier, noise_reduction_db, output_power
+from kfopc_filterpy import HardClipAmplifier, Plant, SoftSaturationAmplifier, output_power
 from kfopc_filterpy.metrics import coherence_and_gain, harmonics_db
 from kfopc_filterpy.plot import curve_style
 
@@ -18,7 +18,7 @@ from .. import bench
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
 from . import cases
 from . import report_parts as parts
-from .cases import BAND_HZ, FS, TONE_HZ, Case, Pair, Setting
+from .cases import BAND_HZ, FS, TONE_HZ, Case, Setting
 from .rows import Row, column, grouped, select, span, worst_claim
 
 PEAK_LIMITED = ("clipping FxLMS", "re-scaling FxLMS", "two-gradient FxLMS")
@@ -76,11 +76,11 @@ def planned_runs() -> int:
 
 def main(runs: Runs) -> StudyReport:
     """Run the study on all ducts at hand."""
-    pairs = cases.ducts()
+    plants = cases.ducts()
     rows: list[AmplifierRow] = []
     tuned = {}
-    for case in all_cases(list(pairs)):
-        own, best = run_case(runs, case, pairs[case.path])
+    for case in all_cases(list(plants)):
+        own, best = run_case(runs, case, plants[case.path])
         rows += own
         tuned[f"{case}, {case.amplifier}"] = {at: parts.tuned_in_words(one) for at, one in best.items()}
     return parts.report_of_rows(
@@ -101,7 +101,7 @@ def main(runs: Runs) -> StudyReport:
         },
         claims=claims(rows),
         figures=[_figure(case, own) for case, own in grouped(rows, "path", "noise", "amplifier").items()],
-        notes=parts.without_measured(pairs),
+        notes=parts.without_measured(plants),
         tables=[_table(rows)],
     )
 
@@ -143,9 +143,9 @@ def saturating(scene: Scene, case: Case, overdrive_db: float, known: str) -> Sce
     return replace(driven, amplifier=amplifier, known_amplifier=amplifier if known == KNOWN else None)
 
 
-def run_case(runs: Runs, case: Case, pair: Pair) -> tuple[list[AmplifierRow], dict[str, dict[str, Tuned | None]]]:
+def run_case(runs: Runs, case: Case, plant: Plant) -> tuple[list[AmplifierRow], dict[str, dict[str, Tuned | None]]]:
     """Return every algorithm at every overdrive, tuned there; those that can know the amplifier without and with it."""
-    scene = cases.driven_case(pair, cases.noise_of(case.noise, DURATION_S), 0.0)
+    scene = cases.driven_case(plant, cases.noise_of(case.noise, DURATION_S), 0.0)
     rows: list[AmplifierRow] = []
     best = {}
     for overdrive, known in product(OVERDRIVES_DB, (UNKNOWN, KNOWN)):
@@ -168,17 +168,17 @@ def _run(
     result = scene.run(bench.make_controller(scene, algorithm, best.setting), record_weights_every=WEIGHTS_EVERY)
     if result.diverged_at_s is not None:
         return AmplifierRow(**own, diverged_at_s=result.diverged_at_s)
-    e, d, y = result.error, result.disturbance, result.control_signal
+    e, d = result.error, result.disturbance
     assert result.weights is not None
     largest = np.abs(result.weights).max(axis=1)
     asked = np.convolve(result.reference, result.weights[-1])[: e.size]
     tonal = case.noise == "tone"
     return AmplifierRow(
         **own,
-        noise_reduction_db=noise_reduction_db(e, d),
+        noise_reduction_db=result.noise_reduction_db,
         harmonics_db=harmonics_db(e, d, TONE_HZ, FS) if tonal else np.nan,
         coherence=np.nan if tonal else coherence_and_gain(d, result.anti_noise, FS, BAND_HZ).coherence,
-        power=output_power(y) / scene.rated_power,
+        power=result.output_power / scene.rated_power,
         asked_power=output_power(asked) / scene.unconstrained_power,
         weight_growth=float(largest[-1] / largest[largest.size // 2]),
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, bandpass_path, output_power
+from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.metrics import coherence_and_gain
 from kfopc_filterpy.plot import plot_disturbance_and_anti_noise, plot_error_spectra, plot_nse
 from kfopc_filterpy.signals import band_limited_noise
@@ -18,7 +18,7 @@ from .. import bench
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, figures_of_merit
 from . import report_parts as parts
 from .broadband_clipped import clipped_claims, run_clipped, starts, starts_table
-from .cases import FS, PAPER, Results, grid_runs, run_seeds
+from .cases import FS, PAPER, Results, bandpass_plant, grid_runs, run_seeds
 from .report_parts import milliseconds
 from .weight_errors import WEIGHTS_EVERY, draw_weight_errors, first_below_s, settled_after_s, weight_error
 
@@ -59,7 +59,7 @@ def main(runs: Runs) -> StudyReport:
     clipped = run_clipped(runs, scene, clipped_scene, tuned)
     clipped_figures = {name: figures_of_merit(rows, clipped_scene) | starts(rows) for name, rows in clipped.items()}
     other = _other_length(runs)
-    powers = {name: [output_power(r.control_signal) for r in rows] for name, rows in results.items()}
+    powers = {name: [r.output_power for r in rows] for name, rows in results.items()}
     first = results["KF-OPC"][0]
     coherence = coherence_and_gain(first.disturbance, first.anti_noise, FS, BAND)
     shown = ("convergence_time_s", "noise_reduction_db")
@@ -112,9 +112,8 @@ def main(runs: Runs) -> StudyReport:
 
 def _scene(n_taps: int) -> Scene:
     noises = {seed: band_limited_noise(BAND, DURATION_S, fs=FS, rng=seed) for seed in SEEDS}
-    paths = (bandpass_path(n, fs=FS) for n in (128, 32))
     return bench.make_scene(
-        noises, *paths, fs=FS, rated_power=RATED_POWER, power_multiple=POWER_MULTIPLE, n_taps=n_taps
+        noises, bandpass_plant(), rated_power=RATED_POWER, power_multiple=POWER_MULTIPLE, n_taps=n_taps
     )
 
 

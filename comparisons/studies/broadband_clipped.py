@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power
+from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.metrics import peak_control_signal
 
 from ..bench import Claim, Runs, Scene, Table, Tuned
@@ -41,9 +41,9 @@ def starts(results: Sequence[SimulationResult]) -> dict[str, list[float]]:
     """Return each seed's figures of the start, which the steady half does not show."""
     return {
         FIRST: [first_second_db(r) for r in results],
-        STEADY: [noise_reduction_db(r.error, r.disturbance) for r in results],
+        STEADY: [r.noise_reduction_db for r in results],
         PEAK: [peak_control_signal(r.control_signal, steady=1.0) for r in results],
-        POWER: [output_power(r.control_signal) for r in results],
+        POWER: [r.output_power for r in results],
     }
 
 

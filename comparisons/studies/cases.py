@@ -1,4 +1,4 @@
-"""Paths, noises, scenes, rows of results and tuning, shared by the studies beyond the paper and the sweeps."""
+"""Plants, noises, scenes, rows of results and tuning, shared by the studies beyond the paper and the sweeps."""
 
 from __future__ import annotations
 
@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, bandpass_path, power_constrained_wiener, signals
-from kfopc_filterpy._types import ChangingPaths
+from kfopc_filterpy import Plant, SimulationResult, bandpass_path, power_constrained_wiener, signals
 from kfopc_filterpy.bounds import PowerConstrainedWiener
-from kfopc_filterpy.loop.inputs import disturbance_at_microphone, noise_gain
-from kfopc_filterpy.paths import duct_paths, path_taps
+from kfopc_filterpy.paths import duct_plant
 
 from ..bench import Runs, Scene, Tuned, algorithms, make_controller, make_scene, run_settings
-from ..bench.measured import DataUnavailableError, MeasuredDuct, MeasuredRoom, load_measured_duct, load_measured_room
+from ..bench.measured import DataUnavailableError, MeasuredDuct, load_measured_duct, load_measured_room
 from ..bench.scene import louder, reachable_weights
 from ..bench.tuning import best_setting, try_settings
 
@@ -38,7 +36,6 @@ SEED = 1
 PAPER = tuple(name for name, own in algorithms().items() if own.of_paper)  # algorithms that the paper compares
 
 Setting = float | tuple[float, float]  # of an algorithm, as in the registry
-Pair = tuple[np.ndarray, np.ndarray]  # taps of the primary and the secondary path
 Results = dict[str, list[Any]]  # of algorithms, a run for each seed
 Noise = Callable[[float, int], np.ndarray]  # of a duration in s and a seed
 
@@ -65,33 +62,34 @@ class Case:
         return f"{self.path}, {self.noise}"
 
 
-# ---- Paths and noises
+# ---- Plants and noises
 
 
-def modelled_paths() -> dict[str, Pair]:
-    """Return primary and secondary taps of the models, by name."""
-    duct = duct_paths(fs=FS)
-    return {
-        "band-pass": (path_taps(bandpass_path(128)), path_taps(bandpass_path(32))),
-        "duct": (path_taps(duct.primary), path_taps(duct.secondary)),
-    }
+def bandpass_plant() -> Plant:
+    """Return the paper's band-pass paths, of 128 and 32 taps."""
+    return Plant(bandpass_path(32, fs=FS), bandpass_path(128, fs=FS))
 
 
-def paths() -> dict[str, Pair]:
-    """Return primary and secondary taps by name, with the measured duct if it is at hand."""
+def modelled_plants() -> dict[str, Plant]:
+    """Return the models by name."""
+    return {"band-pass": bandpass_plant(), "duct": duct_plant(fs=FS)}
+
+
+def plants() -> dict[str, Plant]:
+    """Return the plants by name, with the measured duct if it is at hand."""
     measured = measured_data()
-    return modelled_paths() | ({} if measured is None else {"measured duct": of_unit_gain(measured)})
+    return modelled_plants() | ({} if measured is None else {"measured duct": of_unit_gain(measured)})
 
 
-def of_unit_gain(measured: MeasuredDuct) -> Pair:
-    """Return the taps of a measured duct, whose scale is arbitrary, with a secondary path of gain 1 for white noise."""
+def of_unit_gain(measured: MeasuredDuct) -> Plant:
+    """Return a measured duct, whose scale is arbitrary, with a secondary path of gain 1 for white noise."""
     scale = np.sqrt(np.sum(measured.secondary**2))
-    return measured.primary / scale, measured.secondary / scale
+    return Plant(measured.secondary / scale, measured.primary / scale, fs=measured.fs)
 
 
-def ducts() -> dict[str, Pair]:
-    """Return the taps of the built-in duct, and of the measured one if it is at hand."""
-    return {name: pair for name, pair in paths().items() if name != "band-pass"}
+def ducts() -> dict[str, Plant]:
+    """Return the built-in duct, and the measured one if it is at hand."""
+    return {name: plant for name, plant in plants().items() if name != "band-pass"}
 
 
 def made_noises(band_hz: tuple[float, float] = WIDE_BAND_HZ) -> dict[str, Noise]:
@@ -136,7 +134,7 @@ def recordings(*names: str) -> dict[str, np.ndarray]:
     return {name: duct.noise - duct.noise.mean() for name, duct in ducts.items() if duct is not None}
 
 
-def measured_room() -> MeasuredRoom | None:
+def measured_room() -> Plant | None:
     """Return the measured room, or None if it is not available."""
     with suppress(DataUnavailableError):
         return load_measured_room()
@@ -147,26 +145,23 @@ def measured_room() -> MeasuredRoom | None:
 
 
 def make_case(
-    pair: Pair, noise: np.ndarray, *, n_taps: int, sensor_noise_db: float = SENSOR_NOISE_DB, seed: int = 0
+    plant: Plant, noise: np.ndarray, *, n_taps: int, sensor_noise_db: float = SENSOR_NOISE_DB, seed: int = 0
 ) -> Scene:
     """Return the scene of one noise whose unconstrained control power is 1; the seed is of the sensor noise.
 
     That power is of the filter with which a Kalman filter without state noise would end, ``(R_x' + q/(N P0) I) w = r``
     over the record. Without the ridge, directions that the noise hardly excites could ask for any power.
     """
-    scene = unit_scene(pair, noise, n_taps=n_taps, sensor_noise_db=sensor_noise_db, seed=seed)
+    scene = unit_scene(plant, noise, n_taps=n_taps, sensor_noise_db=sensor_noise_db, seed=seed)
     normal = louder(scene, 1.0 / np.sqrt(bound_of(scene).unconstrained.control_power))
     return replace(normal, unconstrained_power=1.0)
 
 
-def unit_scene(
-    pair: Pair, noise: np.ndarray, *, n_taps: int, sensor_noise_db: float, seed: int, fs: float = FS
-) -> Scene:
+def unit_scene(plant: Plant, noise: np.ndarray, *, n_taps: int, sensor_noise_db: float, seed: int) -> Scene:
     """Return the scene of one noise, with a Wiener control power of 1 and a rated power of 1."""
     return make_scene(
         {seed: noise},
-        *pair,
-        fs=fs,
+        plant,
         rated_power=1.0,
         power_multiple=1.0,
         n_taps=n_taps,
@@ -181,15 +176,21 @@ def noise_of(name: str, duration_s: float, seed: int = SEED) -> np.ndarray:
     return made_noises(BAND_HZ)[name](duration_s + SWITCH_ON_S, seed)
 
 
-def driven_case(pair: Pair, noise: np.ndarray, overdrive_db: float) -> Scene:
+def driven_case(plant: Plant, noise: np.ndarray, overdrive_db: float) -> Scene:
     """Return the scene of a noise whose unconstrained control power, 1, is so many dB above the rated one."""
-    return with_overdrive(make_case(pair, noise, n_taps=N_TAPS), overdrive_db)
+    return with_overdrive(make_case(plant, noise, n_taps=N_TAPS), overdrive_db)
 
 
-def changing(scene: Scene, primary: ChangingPaths, *, noise_level_db: Any = 0.0) -> Scene:
-    """Return a scene of one seed whose primary path and noise change as `simulate` has it."""
-    x = scene.references[0] * noise_gain(noise_level_db, scene.references[0].size, FS)
-    return replace(scene, references=[x], disturbances=[disturbance_at_microphone(x, primary, None, FS)])
+def jumping(scene: Scene, plant: Plant, span_s: tuple[float, float], gain_db: float) -> Scene:
+    """Return a scene of one seed whose noise is louder between two times of the record."""
+    begin_s, end_s = span_s
+    louder = signals.level_jump(scene.references[0], begin_s, gain_db, fs=FS)
+    return heard_on(scene, plant, signals.level_jump(louder, end_s, -gain_db, fs=FS))
+
+
+def heard_on(scene: Scene, plant: Plant, x: np.ndarray) -> Scene:
+    """Return a scene of one seed with another noise, which reaches the microphone as on a plant."""
+    return replace(scene, references=[x], disturbances=[plant.disturbance(x)])
 
 
 def with_overdrive(scene: Scene, overdrive_db: float) -> Scene:
@@ -201,9 +202,15 @@ def bound_of(scene: Scene, segment_s: float = 1.0) -> PowerConstrainedWiener:
     """Return the power-constrained Wiener solutions of a case, of weights that controllers reach."""
     ridge = scene.measurement_noise / (scene.settled[0].shape[-1] * scene.initial_variance)
     with reachable_weights():
-        plant = scene.references[0], scene.disturbances[0], scene.secondary, scene.n_taps, scene.rated_power
         return power_constrained_wiener(
-            *plant, fs=scene.fs, segment_s=segment_s, switch_on_s=scene.switch_on_s, ridge=ridge
+            scene.references[0],
+            scene.plant,
+            n_taps=scene.n_taps,
+            rated_power=scene.rated_power,
+            disturbance=scene.disturbances[0],
+            segment_s=segment_s,
+            switch_on_s=scene.switch_on_s,
+            ridge=ridge,
         )
 
 

@@ -9,14 +9,14 @@ from itertools import chain, product
 import numpy as np
 
 from kfopc_filterpy import convergence_time_s
-from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
+from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.plot import curve_style
 
 from .. import bench
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned
 from . import cases
 from . import report_parts as parts
-from .cases import FS, SWITCH_ON_S, WINDOW_S, Case, noises, paths
+from .cases import FS, SWITCH_ON_S, WINDOW_S, Case, noises, plants
 from .constraint_amplifiers import LIMITED, ClippedRow, Settings, amplifier_table, controller_of, run_amplifiers
 from .rows import WindowRow, column, figures_of, select, worst_claim
 
@@ -53,25 +53,25 @@ class ConstraintRow(WindowRow):
 
 def planned_runs() -> int:
     """Return the number of jobs of the study."""
-    everything = [Case(*names) for names in product(paths(), noises())]
+    everything = [Case(*names) for names in product(plants(), noises())]
     runs = len(everything) * (cases.grid_runs(TUNED) + len(DURATIONS_S) * len(SEEDS))
-    return runs + sum(case.stationary for case in everything) + len(paths()) * len(CLIPPED_NOISES)
+    return runs + sum(case.stationary for case in everything) + len(plants()) * len(CLIPPED_NOISES)
 
 
 def main(runs: Runs) -> StudyReport:
-    """Run the study on all paths and noises at hand; the first seed and duration are what settings are tuned on."""
-    pairs, made = paths(), noises()
-    everything = [Case(*names) for names in product(pairs, made)]
+    """Run the study on all plants and noises at hand; the first seed and duration are what settings are tuned on."""
+    at_hand, made = plants(), noises()
+    everything = [Case(*names) for names in product(at_hand, made)]
 
     def scene(case: Case, duration_s: float = DURATIONS_S[0], seed: int = SEEDS[0]) -> Scene:
         noise = made[case.noise](duration_s + SWITCH_ON_S, seed)
-        return replace(cases.make_case(pairs[case.path], noise, n_taps=N_TAPS), rated_power=SHARES[0])
+        return replace(cases.make_case(at_hand[case.path], noise, n_taps=N_TAPS), rated_power=SHARES[0])
 
     def times(case: Case) -> dict[str, float]:
         return convergence_times([scene(case, seed=seed) for seed in SEEDS], tuned[case])
 
     def amplified(case: Case) -> list[ClippedRow]:
-        return run_amplifiers(scene(case), pairs[case.path][0], case, tuned[case])
+        return run_amplifiers(scene(case), at_hand[case.path], case, tuned[case])
 
     tuned: dict[Case, Settings] = {}
     for case in everything:
@@ -81,7 +81,7 @@ def main(runs: Runs) -> StudyReport:
     rows = list(chain(*runs.map(lambda job: run_case(scene(*job), *job, tuned[job[0]]), jobs)))
     stationary = [case for case in everything if case.stationary]
     settled = dict(zip(map(str, stationary), runs.map(times, stationary), strict=True))
-    clipped = list(chain(*runs.map(amplified, [Case(*names) for names in product(pairs, CLIPPED_NOISES)])))
+    clipped = list(chain(*runs.map(amplified, [Case(*names) for names in product(at_hand, CLIPPED_NOISES)])))
     return parts.report_of_rows(
         rows,
         name="constraint",
@@ -105,7 +105,7 @@ def main(runs: Runs) -> StudyReport:
         extra={"convergence_s": settled},
         claims=claims(rows, clipped, settled),
         figures=[_cases_figure(rows)],
-        notes=parts.without_measured(pairs),
+        notes=parts.without_measured(at_hand),
         tables=[_summary_table(rows), amplifier_table(clipped)],
     )
 

@@ -6,13 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
-from kfopc_filterpy import HardClipAmplifier, OutputLimiter
+from kfopc_filterpy import HardClipAmplifier, OutputLimiter, Plant
 from kfopc_filterpy.paths import path_taps, perturbed_path
 
 from ..bench import Scene, Table, Tuned, make_controller
-from .cases import FS, WINDOW_S, Case, changing
+from .cases import FS, WINDOW_S, Case, jumping
 from .rows import WindowRow, cell, figures_of
 
 LIMITED = ("KF-OPC limited", "KF-PB limited")
@@ -37,7 +35,7 @@ def controller_of(scene: Scene, name: str, tuned: Settings, amplifier: Any = Non
     return controller
 
 
-def run_amplifiers(scene: Scene, primary: np.ndarray, case: Case, tuned: Settings) -> list[ClippedRow]:
+def run_amplifiers(scene: Scene, plant: Plant, case: Case, tuned: Settings) -> list[ClippedRow]:
     """Run with an amplifier that clips: known, unknown or known wrongly; behind a limiter, with a wrong path or a level jump."""
     limit = scene.amplitude_limit
     clipping = replace(scene, amplifier=HardClipAmplifier(limit))
@@ -52,12 +50,11 @@ def run_amplifiers(scene: Scene, primary: np.ndarray, case: Case, tuned: Setting
         for name in ("KF-ANC", "KF-OPC", "KF-PB")
         for words, amplifier in known.items()
     ]
-    wrong = replace(scene, secondary=path_taps(perturbed_path(scene.secondary, fs=FS, gain_db=6.0, phase_deg=45.0)))
-    begin_s, end_s = JUMP_S
-    jumping = changing(clipping, primary, noise_level_db=[(0.0, 0.0), (begin_s, JUMP_DB), (end_s, 0.0)])
+    estimate = path_taps(perturbed_path(scene.secondary, fs=FS, gain_db=6.0, phase_deg=45.0))
+    wrong, louder = replace(scene, secondary_estimate=estimate), jumping(clipping, plant, JUMP_S, JUMP_DB)
     for name in LIMITED:
         jobs.append((clipping, name, "path 6 dB, 45° off", controller_of(wrong, name, tuned)))
-        jobs.append((jumping, name, f"{JUMP_DB:g} dB louder for a second", controller_of(scene, name, tuned)))
+        jobs.append((louder, name, f"{JUMP_DB:g} dB louder for a second", controller_of(scene, name, tuned)))
     return [
         ClippedRow(**case.place, algorithm=name, known=words, **figures_of(at.run(controller), scene.rated_power))
         for at, name, words, controller in jobs

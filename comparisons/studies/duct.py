@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db, output_power
+from kfopc_filterpy import Plant, SimulationResult
 from kfopc_filterpy.bounds import power_constrained_solution, wiener_solution
 from kfopc_filterpy.metrics import overshoot
-from kfopc_filterpy.paths import duct_paths, fir_path, secondary_path_gain
+from kfopc_filterpy.paths import Duct, duct_plant, fir_path, secondary_path_gain
 from kfopc_filterpy.plot import plot_constraint_factor, plot_error_spectra, plot_nse, plot_output_power
 from kfopc_filterpy.signals import compressor_noise
 
@@ -55,14 +55,14 @@ def planned_runs() -> int:
 
 def main(runs: Runs) -> StudyReport:
     """Run the study with the built-in duct and compressor-like noise."""
-    duct = duct_paths(fs=FS)
+    duct = Duct()
     parameters = {
         "noise": Parameter("fluctuating shaft harmonics and broadband noise, as of a compressor", "seeded stand-in"),
-        "primary_path": Parameter(f"modelled duct, {duct.model.length_m:g} m", "defaults of duct_paths"),
-        "secondary_path": Parameter(f"loudspeaker at {duct.model.loudspeaker_m:g} m", "defaults of duct_paths"),
+        "primary_path": Parameter(f"modelled duct, {duct.length_m:g} m", "defaults of duct_plant"),
+        "secondary_path": Parameter(f"loudspeaker at {duct.loudspeaker_m:g} m", "defaults of duct_plant"),
     }
     noise = compressor_noise(DURATION_S, fs=FS, rng=SEED)
-    return _study(runs, "duct", "Machine noise in a modelled duct", noise, (duct.primary, duct.secondary), parameters)
+    return _study(runs, "duct", "Machine noise in a modelled duct", noise, duct_plant(duct, fs=FS), parameters)
 
 
 def main_measured(runs: Runs) -> StudyReport | str:
@@ -84,7 +84,6 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
             f"{name} is left out: set KFOPC_DATA to a folder with the measured data, or run again with a network "
             f"({shorten(str(error), 120, placeholder=' ...')})"
         )
-    paths = tuple(fir_path(taps, data.fs) for taps in of_unit_gain(data))
     parameters = {
         "noise": Parameter(f"recorded {noise} noise, mean removed", chosen),
         "primary_path": Parameter(f"measured duct, {data.primary.size} taps", "as published, scale arbitrary"),
@@ -93,16 +92,15 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
         ),
     }
     title = f"Recorded {noise} noise in a measured duct"
-    return _study(runs, name, title, data.noise - data.noise.mean(), paths, parameters)
+    return _study(runs, name, title, data.noise - data.noise.mean(), of_unit_gain(data), parameters)
 
 
 def _study(
-    runs: Runs, name: str, title: str, noise: np.ndarray, paths: tuple[Any, ...], parameters: dict[str, Parameter]
+    runs: Runs, name: str, title: str, noise: np.ndarray, plant: Plant, parameters: dict[str, Parameter]
 ) -> StudyReport:
     scene = bench.make_scene(
         {SEED: noise},
-        *paths,
-        fs=FS,
+        plant,
         rated_power=RATED_POWER,
         power_multiple=POWER_MULTIPLE,
         n_taps=N_TAPS,
@@ -112,16 +110,17 @@ def _study(
     smaller = replace(scene, rated_power=scene.unconstrained_power / OTHER_MULTIPLE)
 
     def run_all(at: Scene, names: Sequence[str]) -> dict[str, SimulationResult]:
-        return run_each(runs, at, {name: tuned[name].setting for name in names}, record_powers=True)
+        return run_each(runs, at, {name: tuned[name].setting for name in names})
 
     results, of_smaller = run_all(scene, ALGORITHMS), run_all(smaller, RATED)
     figures = {algorithm: figures_of(result, RATED_POWER) for algorithm, result in results.items()}
     at_smaller = {algorithm: figures_of(result, smaller.rated_power) for algorithm, result in of_smaller.items()}
     start = start_under_constraint(scene, tuned, results["KF-OPC"].constraint_factor)
-    wiener = wiener_solution(*scene.settled, scene.secondary, scene.n_taps)
-    reference_gain = float(secondary_path_gain(scene.secondary, reference=scene.settled[0]))
+    x, d = scene.settled
+    wiener = wiener_solution(x, plant, n_taps=N_TAPS, disturbance=d)
+    reference_gain = float(secondary_path_gain(scene.secondary, reference=x))
     control_gain = float(wiener.antinoise_power / wiener.control_power)
-    bound = power_constrained_solution(*scene.settled, scene.secondary, scene.n_taps, RATED_POWER)
+    bound = power_constrained_solution(x, plant, n_taps=N_TAPS, rated_power=RATED_POWER, disturbance=d)
     return parts.report_of_paper(
         scene,
         tuned,
@@ -160,7 +159,7 @@ def _study(
             ),
             *start_table(start),
         ],
-        figures=_figures_of(results, paths),
+        figures=_figures_of(results, plant),
         sounds=parts.sounds({algorithm: results[algorithm] for algorithm in PAPER}),
     )
 
@@ -168,9 +167,9 @@ def _study(
 def figures_of(result: SimulationResult, rated_power: float) -> Figures:
     """Return the figures that the claims need of a run."""
     return Figures(
-        noise_reduction_db=noise_reduction_db(result.error, result.disturbance),
-        mean_nse_db=float(np.mean(nse_db(result.error, result.disturbance, FS, NSE_WINDOW_S))),
-        power=output_power(result.control_signal) / rated_power,
+        noise_reduction_db=result.noise_reduction_db,
+        mean_nse_db=float(np.mean(result.nse_db(NSE_WINDOW_S))),
+        power=float(result.output_power / rated_power),
         worst_second=overshoot(result.control_signal, rated_power, FS, window_s=1.0),
         worst_50_ms=overshoot(result.control_signal, rated_power, FS),
     )
@@ -222,8 +221,10 @@ def _rating_table(at: Mapping[float, Mapping[str, Figures]]) -> Table:
     )
 
 
-def _figures_of(results: Mapping[str, SimulationResult], paths: tuple[Any, Any]) -> list[FigureItem]:
+def _figures_of(results: Mapping[str, SimulationResult], plant: Plant) -> list[FigureItem]:
     group = list(results.values())
+    assert plant.primary is not None
+    paths = {"primary path": plant.primary[0, 0], "secondary path": plant.secondary[0, 0]}
 
     def spectra(names: Sequence[str], ax: Any) -> None:
         # With longer segments the harmonics are so sharp that the curves hide each other.
@@ -253,6 +254,6 @@ def _figures_of(results: Mapping[str, SimulationResult], paths: tuple[Any, Any])
             lambda ax: plot_constraint_factor([results["KF-OPC"], results["MOV-FxLMS"]], ax=ax),
         ),
         parts.draw_paths(
-            "Primary and secondary path.", dict(zip(("primary path", "secondary path"), paths, strict=True))
+            "Primary and secondary path.", {name: fir_path(taps, plant.fs) for name, taps in paths.items()}
         ),
     ]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db
+from kfopc_filterpy import SimulationResult
 
 from ..bench import Claim, Scene, Table, Tuned, make_controller
 from .cases import FS
@@ -86,10 +86,10 @@ def start_under_constraint(scene: Scene, tuned: Mapping[str, Tuned], factor: np.
 
 def times_to_a_common_level(one: SimulationResult, other: SimulationResult) -> tuple[float, float]:
     """Return when the NSE of each first comes within 1 dB of the lesser of their steady noise reductions, in seconds."""
-    level = 1.0 - min(noise_reduction_db(r.error, r.disturbance) for r in (one, other))
+    level = 1.0 - min(r.noise_reduction_db for r in (one, other))
 
     def first(result: SimulationResult) -> float:
-        below = nse_db(result.error, result.disturbance, FS, TIME_WINDOW_S) <= level
+        below = result.nse_db(TIME_WINDOW_S) <= level
         return float(np.argmax(below)) / FS if below.any() else np.inf
 
     return first(one), first(other)

@@ -10,13 +10,13 @@ from itertools import product
 import numpy as np
 from scipy.signal import fftconvolve
 
-from kfopc_filterpy import MOVFxLMS
-from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
+from kfopc_filterpy import Plant, mov_fx_lms, simulate
+from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.metrics import overshoot
 
 from ..bench import Claim, FigureItem, Parameter, Runs, StudyReport, Table
 from . import kf_pb_cases as cases
-from .cases import FS, SENSOR_NOISE_DB, Pair
+from .cases import FS, SENSOR_NOISE_DB
 from .kf_pb_cases import CHANGING, FAULTS, STEADY, Rated, make_rated
 from .report_parts import MARK, new_figure, report_of_rows, without_measured
 from .rows import column, grouped, select, worst_claim
@@ -71,9 +71,9 @@ class FaultRow:
 
 def jobs() -> tuple[list[tuple[str, str, float]], list[tuple[str, str]]]:
     """Return the cases of the classes and those of the faults."""
-    pairs, made = cases.all_paths(), cases.noises()
+    plants, made = cases.all_plants(), cases.noises()
     steady = [noise for noise, (kind, _) in made.items() if kind == STEADY]
-    return list(product(pairs, made, cases.SHARES)), list(product(pairs, steady[::2]))
+    return list(product(plants, made, cases.SHARES)), list(product(plants, steady[::2]))
 
 
 def planned_runs() -> int:
@@ -83,11 +83,11 @@ def planned_runs() -> int:
 
 
 def main(runs: Runs) -> StudyReport:
-    """Run the study on the paths and noises at hand."""
-    pairs = cases.all_paths()
+    """Run the study on the plants and noises at hand."""
+    plants = cases.all_plants()
     classes, faults = jobs()
-    rows = list(runs.map(partial(class_row, pairs), classes))
-    wrong = [row for some in runs.map(partial(fault_rows, pairs), faults) for row in some]
+    rows = list(runs.map(partial(class_row, plants), classes))
+    wrong = [row for some in runs.map(partial(fault_rows, plants), faults) for row in some]
     return report_of_rows(
         rows,
         name="kf-pb",
@@ -109,7 +109,7 @@ def main(runs: Runs) -> StudyReport:
         extra={"faults": [asdict(row) for row in wrong]},
         claims=claims(rows, wrong),
         figures=[loss_figure(rows)],
-        notes=without_measured(pairs),
+        notes=without_measured(plants),
         tables=[class_table(rows), case_table(rows), fault_table(wrong)],
     )
 
@@ -117,11 +117,11 @@ def main(runs: Runs) -> StudyReport:
 # ---- Runs
 
 
-def class_row(pairs: dict[str, Pair], job: tuple[str, str, float]) -> ClassRow:
+def class_row(plants: dict[str, Plant], job: tuple[str, str, float]) -> ClassRow:
     """Run KF-PB with the exact path and its default settings, and MOV-FxLMS with those of its grid."""
     path, noise, share = job
     kind, make = cases.noises()[noise]
-    case = make_rated(pairs[path], make(), share)
+    case = make_rated(plants[path], make(), share)
     result = case.run(case.kf_pb(case.secondary))
     error, y = result.error, result.control_signal
     return ClassRow(
@@ -142,18 +142,18 @@ def best_mov_db(case: Rated) -> float:
     gain, rated = np.var(filtered) / np.var(case.reference), case.rated_power
     best = -np.inf
     for step, penalty in product(STEPS / (cases.N_TAPS * np.var(filtered)), (None, *(gain * PENALTIES))):
-        own = {"step_size": step, "rated_power": rated, "penalty_factor": penalty}
-        result = case.run(MOVFxLMS(cases.N_TAPS, case.secondary, **own))
+        own = {"rated_power": rated} if penalty is None else {"penalty_factor": penalty}
+        result = case.run(mov_fx_lms(cases.N_TAPS, case.plant, step_size=step, **own))
         if result.diverged_at_s is None:
             kept = overshoot(result.control_signal, rated, FS, window_s=DEFAULT_AVERAGING_S) <= 1.0
             best = max(best, case.reduction_db(result.error)) if kept else best
     return best
 
 
-def fault_rows(pairs: dict[str, Pair], job: tuple[str, str]) -> list[FaultRow]:
+def fault_rows(plants: dict[str, Plant], job: tuple[str, str]) -> list[FaultRow]:
     """Run KF-PB with every fault, from the start and as a jump."""
     path, noise = job
-    case = make_rated(pairs[path], cases.noises()[noise][1](), cases.SHARES[0])
+    case = make_rated(plants[path], cases.noises()[noise][1](), cases.SHARES[0])
     right, same = case.secondary, case.disturbance
     reference, _ = run_with_jump(case, right, right, same)
     runs = []
@@ -176,10 +176,12 @@ def run_with_jump(
     """Return the error and the alarms of a run whose secondary path and disturbance become others at `JUMP_S`."""
     controller, jump_s = case.kf_pb(estimate), cases.SILENT_S + JUMP_S
     at = round(jump_s * FS)
-    result = case.run(
+    result = simulate(
         controller,
-        secondary_path=[(0.0, case.secondary), (jump_s, later)],
+        case.reference,
+        case.plant.changed_at(jump_s, secondary=later),
         disturbance=np.concatenate([case.disturbance[:at], disturbance[at:]]),
+        switch_on_s=cases.SILENT_S,
     )
     return result.error, controller.alarms
 

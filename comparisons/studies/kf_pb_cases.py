@@ -1,4 +1,4 @@
-"""Paths, noises and faults that KF-PB is judged in, and the fixed filters of each case: for its study and the loss map."""
+"""Plants, noises and faults that KF-PB is judged in, and the fixed filters of each case: for its study and the loss map."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from scipy.signal import fftconvolve
 
-from kfopc_filterpy import kf_pb, noise_reduction_db, power_constrained_wiener, simulate
+from kfopc_filterpy import Plant, kf_pb, noise_reduction_db, power_constrained_wiener, simulate
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.signals import level_jump, looped
 
 from ..bench.scene import reachable_weights
-from .cases import FS, SENSOR_NOISE_DB, Pair, made_noises, measured_room, paths, recordings
+from .cases import FS, SENSOR_NOISE_DB, made_noises, measured_room, plants, recordings
 
 N_TAPS = 256
 SILENT_S, DURATION_S = 3.0, 20.0  # before and after the control is switched on
@@ -68,21 +68,28 @@ def mixed(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return one / np.std(one) * ((t < 7) | (t >= 13)) + other / np.std(other) * (t >= 7)
 
 
-def all_paths() -> dict[str, Pair]:
-    """Return the pairs of paths of the studies, with one of the measured room if it is at hand."""
+def all_plants() -> dict[str, Plant]:
+    """Return the plants of the studies, with one loudspeaker and microphone of the measured room if it is at hand."""
     room = measured_room()
-    return paths() | ({} if room is None else {"measured room": (room.primary[0, 0], room.secondary[0, 0])})
+    if room is None or room.primary is None:
+        return plants()
+    return plants() | {"measured room": Plant(room.secondary[0, 0], room.primary[0, 0], fs=room.fs)}
 
 
 @dataclass(frozen=True)
 class Rated:
-    """A noise, its disturbance with sensor noise, the secondary path, and a rated power."""
+    """A noise, its disturbance with sensor noise, the plant behind it, and a rated power."""
 
     reference: np.ndarray
     disturbance: np.ndarray
-    secondary: np.ndarray
+    plant: Plant  # its secondary path; the disturbance takes the place of the primary one
     rated_power: float
     bound_error: np.ndarray  # of each second's own fixed filter within the rated power
+
+    @property
+    def secondary(self) -> np.ndarray:
+        """The taps of the secondary path."""
+        return self.plant.secondary[0, 0]
 
     @property
     def after(self) -> np.ndarray:
@@ -93,10 +100,9 @@ class Rated:
         """Return KF-PB with an estimate of the secondary path."""
         return kf_pb(N_TAPS, estimate, rated_power=self.rated_power, fs=FS, **options)
 
-    def run(self, controller: Any, **changed: Any) -> Any:
-        """Return the run of a controller; `changed` is what another plant has in place of the case's."""
-        plant: dict[str, Any] = {"disturbance": self.disturbance, "secondary_path": self.secondary, "fs": FS}
-        return simulate(controller, self.reference, **plant | changed, switch_on_s=SILENT_S)
+    def run(self, controller: Any) -> Any:
+        """Return the run of a controller."""
+        return simulate(controller, self.reference, self.plant, disturbance=self.disturbance, switch_on_s=SILENT_S)
 
     def reduction_db(self, error: np.ndarray, begin_s: float = 1.0, end_s: float | None = None) -> float:
         """Return the noise reduction between two times after switch-on, up to the end if only one is given."""
@@ -104,25 +110,25 @@ class Rated:
         return noise_reduction_db(error[part], self.after[part], steady=1.0)
 
 
-def make_rated(pair: Pair, noise: np.ndarray, share: float) -> Rated:
+def make_rated(plant: Plant, noise: np.ndarray, share: float) -> Rated:
     """Return a case whose rated power is a share of what full control needs."""
-    primary, secondary = pair
     x = noise / np.std(noise)
-    d = fftconvolve(x, primary)[: x.size]
+    d = plant.disturbance(x)
     d += 10 ** (SENSOR_NOISE_DB / 20) * np.std(d) * np.random.default_rng(SEED).standard_normal(d.size)
-    needed = with_any_power(x, d, secondary, N_TAPS).control_power
-    bound = fixed_filters(x, d, secondary, N_TAPS, rated_power=share * needed).per_second.error
-    return Rated(x, d, secondary, share * needed, bound)
+    heard = Plant(plant.secondary, fs=plant.fs)
+    needed = with_any_power(x, d, heard, N_TAPS).control_power
+    bound = fixed_filters(x, d, heard, N_TAPS, rated_power=share * needed).per_second.error
+    return Rated(x, d, heard, share * needed, bound)
 
 
-def with_any_power(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int) -> Any:
+def with_any_power(x: np.ndarray, d: np.ndarray, plant: Plant, n_taps: int) -> Any:
     """Return the best fixed filter of a length for a reference and a disturbance, whatever power it takes."""
-    ridge = 1e-4 * np.var(fftconvolve(x, secondary)[: x.size])
+    ridge = 1e-4 * np.var(fftconvolve(x, plant.secondary[0, 0])[: x.size])
     whole = {"rated_power": 1e12, "segment_s": DURATION_S, "ridge": ridge}
-    return fixed_filters(x, d, secondary, n_taps, **whole).unconstrained
+    return fixed_filters(x, d, plant, n_taps, **whole).unconstrained
 
 
-def fixed_filters(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int, **settings: float) -> Any:
+def fixed_filters(x: np.ndarray, d: np.ndarray, plant: Plant, n_taps: int, **settings: Any) -> Any:
     """Return the power-constrained Wiener solutions."""
     with reachable_weights():
-        return power_constrained_wiener(x, d, secondary, n_taps, fs=FS, switch_on_s=SILENT_S, **settings)
+        return power_constrained_wiener(x, plant, n_taps=n_taps, disturbance=d, switch_on_s=SILENT_S, **settings)

@@ -8,11 +8,11 @@ from functools import partial
 
 import numpy as np
 
-from kfopc_filterpy import OutputLimiter
+from kfopc_filterpy import OutputLimiter, Plant
 
 from ..bench import FigureItem, Parameter, Runs, StudyReport, Table
 from . import kf_pb_cases as cases
-from .cases import FS, SENSOR_NOISE_DB, Pair
+from .cases import FS, SENSOR_NOISE_DB
 from .kf_pb_cases import FAULTS, STEADY, fixed_filters, make_rated, with_any_power
 from .report_parts import new_figure, report_of_rows, without_measured
 from .rows import grouped
@@ -44,17 +44,17 @@ class LossRow:
         return -np.diff([-SENSOR_NOISE_DB, *self.reduction_db])
 
 
-def loss_row(pairs: dict[str, Pair], job: tuple[str, str]) -> LossRow:
+def loss_row(plants: dict[str, Plant], job: tuple[str, str]) -> LossRow:
     """Run every stage of a case."""
     path, noise = job
-    case = make_rated(pairs[path], cases.noises()[noise][1](), cases.SHARES[0])
+    case = make_rated(plants[path], cases.noises()[noise][1](), cases.SHARES[0])
     wrong = FAULTS[FAULT](case.secondary)
     controllers = [
         case.kf_pb(case.secondary, secondary_path_uncertainty=None),
         case.kf_pb(wrong),
         case.kf_pb(wrong, limiter=OutputLimiter(case.rated_power, fs=FS)),
     ]
-    plant = (case.reference, case.disturbance, case.secondary)
+    plant = (case.reference, case.disturbance, case.plant)
     errors = [*(with_any_power(*plant, n_taps).error for n_taps in (LONG, cases.N_TAPS)), case.bound_error]
     errors += [case.run(controller).error for controller in controllers]
     bound = fixed_filters(*plant, cases.N_TAPS, rated_power=case.rated_power)
@@ -64,9 +64,9 @@ def loss_row(pairs: dict[str, Pair], job: tuple[str, str]) -> LossRow:
 
 
 def jobs() -> list[tuple[str, str]]:
-    """Return the cases: every pair of paths with every steady noise at hand."""
+    """Return the cases: every plant with every steady noise at hand."""
     steady = [noise for noise, (kind, _) in cases.noises().items() if kind == STEADY]
-    return [(path, noise) for path in cases.all_paths() for noise in steady]
+    return [(path, noise) for path in cases.all_plants() for noise in steady]
 
 
 def planned_runs() -> int:
@@ -76,8 +76,8 @@ def planned_runs() -> int:
 
 def main(runs: Runs) -> StudyReport:
     """Run the study on the paths and noises at hand."""
-    pairs = cases.all_paths()
-    rows = list(runs.map(partial(loss_row, pairs), jobs()))
+    plants = cases.all_plants()
+    rows = list(runs.map(partial(loss_row, plants), jobs()))
     return report_of_rows(
         rows,
         name="loss-map",
@@ -95,13 +95,13 @@ def main(runs: Runs) -> StudyReport:
             "seed": Parameter(cases.SEED, "of noise and sensor noise"),
         },
         figures=[loss_figure(rows)],
-        notes=without_measured(pairs),
+        notes=without_measured(plants),
         tables=[mean_table(rows), loss_table(rows)],
     )
 
 
 def mean_table(rows: Sequence[LossRow]) -> Table:
-    """Return a line for each pair of paths: means over the noises."""
+    """Return a line for each plant: means over the noises."""
     return Table(
         "means",
         "Noise reduction lost at each stage and left, in dB, means over the noises; a negative loss is a gain",

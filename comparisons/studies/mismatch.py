@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from kfopc_filterpy import Plant
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
 
 from .. import bench
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
 from . import report_parts as parts
-from .cases import BAND_HZ, FS, Case, Pair, driven_case, ducts, grid_runs, grids, noise_of
+from .cases import BAND_HZ, FS, Case, driven_case, ducts, grid_runs, grids, noise_of
 from .rows import Row, column, figure_table, grouped, select, span, worst_claim
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB", "FxRLS", "FxLMS", "MOV-FxLMS", "optimal leaky FxLMS")
@@ -68,12 +69,12 @@ def planned_runs() -> int:
 
 def main(runs: Runs) -> StudyReport:
     """Run the study on all ducts at hand."""
-    pairs = ducts()
-    known = {name: estimates(secondary) for name, (_, secondary) in pairs.items()}
+    plants = ducts()
+    known = {name: estimates(plant.secondary[0, 0]) for name, plant in plants.items()}
     rows: list[MismatchRow] = []
     tuned, scenes = {}, {}
-    for case in cases(list(pairs)):
-        scene = scenes[str(case)] = case_scene(case, pairs[case.path])
+    for case in cases(list(plants)):
+        scene = scenes[str(case)] = case_scene(case, plants[case.path])
         own, best = run_case(runs, case, scene, known[case.path])
         rows += own
         tuned[str(case)] = {f"{kind} {amount:g}": parts.tuned_in_words(t) for (kind, amount), t in best.items()}
@@ -95,7 +96,7 @@ def main(runs: Runs) -> StudyReport:
         claims=claims(rows),
         figures=[_figure(rows, case) for case in dict.fromkeys(row.case for row in rows)],
         notes=[
-            *parts.without_measured(pairs),
+            *parts.without_measured(plants),
             f"A delay of {FS / (2 * sum(BAND_HZ)):.1f} samples turns the middle of the band by 90 degrees, one of "
             f"{FS / (4 * BAND_HZ[1]):.0f} its upper edge.",
             "There is one seed and one record for each case: differences of some tenths of a dB mean nothing.",
@@ -131,9 +132,9 @@ def estimates(secondary: np.ndarray) -> dict[Point, np.ndarray]:
     }
 
 
-def case_scene(case: Case, pair: Pair) -> Scene:
+def case_scene(case: Case, plant: Plant) -> Scene:
     """Return the scene of a case with the exact path."""
-    return driven_case(pair, noise_of(case.noise, DURATION_S), OVERDRIVE_DB)
+    return driven_case(plant, noise_of(case.noise, DURATION_S), OVERDRIVE_DB)
 
 
 def run_case(

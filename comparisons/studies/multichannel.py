@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power
+from kfopc_filterpy import SimulationResult, output_power
 from kfopc_filterpy.plot import curve_style, plot_nse
 
 from .. import bench
@@ -35,7 +35,7 @@ def cases() -> list[tuple[Place, str]]:
 
 def names(place: Place) -> list[str]:
     """Return the algorithms that run in a place: those of all weights only in small systems."""
-    weights = place.secondary.shape[1] * place.n_taps
+    weights = place.plant.n_loudspeakers * place.n_taps
     return [name for name in algorithms(several_channels=True) if name not in DIRECT or weights <= MOST_WEIGHTS]
 
 
@@ -72,7 +72,7 @@ def main(runs: Runs) -> StudyReport:
             mapped = {name: results[name] for name in (heard[0], heard[2])}
             figures = [
                 _course_figure(own, {name: results[name] for name in heard}),
-                rooms.map_figure(place.secondary.shape[1], noise, scene, mapped),
+                rooms.map_figure(place.plant.n_loudspeakers, noise, scene, mapped),
             ]
             off = Sound("off", "First microphone, control off", results[KF_PB].disturbance[0], group="room")
             errors = [(f"First microphone, {name}", results[name].error[0]) for name in heard]
@@ -88,7 +88,7 @@ def main(runs: Runs) -> StudyReport:
         ),
         fs=rooms.FS,
         parameters={
-            "fs_hz": Parameter({name: place.fs for name, place in places().items()}, "the measured room's own"),
+            "fs_hz": Parameter({name: place.plant.fs for name, place in places().items()}, "the measured room's own"),
             "n_taps": Parameter({name: place.n_taps for name, place in places().items()}, "of each control filter"),
             "duration_s": Parameter([DURATION_S, RECORDED_S], "from switch-on, of steady noises and of recordings"),
             "rated_power": Parameter(
@@ -136,8 +136,7 @@ def channel_row(scene: Scene, result: SimulationResult | None, **place: Any) -> 
     if result is None or result.diverged_at_s is not None:
         at = 0.0 if result is None else result.diverged_at_s
         return ChannelRow(**place, diverged_at_s=at, powers=[np.nan] * scene.rated_power.size)
-    reduction = noise_reduction_db(result.error, result.disturbance)
-    return ChannelRow(**place, noise_reduction_db=reduction, **_powers(scene, result.control_signal))
+    return ChannelRow(**place, noise_reduction_db=result.noise_reduction_db, **_powers(scene, result.control_signal))
 
 
 def _powers(scene: Scene, control_signal: np.ndarray) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 import pyroomacoustics as pra
 from scipy.signal import fftconvolve
 
-from kfopc_filterpy import SimulationResult, signals
+from kfopc_filterpy import Plant, SimulationResult, signals
 
 from ..bench import FigureItem, Scene
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of, measured_room, recordings, unit_scene
@@ -38,25 +38,22 @@ MAP_SPACING_M = 0.125
 
 @dataclass(frozen=True)
 class Place:
-    """Paths and noises of one room."""
+    """A plant of several channels, and its noises."""
 
     name: str
-    fs: float
     n_taps: int
-    primary: np.ndarray
-    secondary: np.ndarray
+    plant: Plant
     noises: dict[str, Callable[[float], np.ndarray]]  # functions of a duration in s
 
 
 @dataclass(frozen=True)
 class Room:
-    """Positions (n, 3) in m in the built-in room, and the paths between them, (K, I, n_taps) and (K, J, n_taps)."""
+    """Positions (n, 3) in m in the built-in room, and the plant between them."""
 
     sources_m: np.ndarray
     loudspeakers_m: np.ndarray
     microphones_m: np.ndarray
-    primary: np.ndarray
-    secondary: np.ndarray
+    plant: Plant
 
 
 def built_in_room(size: int) -> Room:
@@ -69,8 +66,8 @@ def built_in_room(size: int) -> Room:
     source = np.array([SOURCE_M])
     loudspeakers = np.stack([3.2 + to_and_fro, np.linspace(0.6, 3.4, size), np.full(size, 1.1)], axis=1)
     microphones = np.stack([4.4 - to_and_fro, np.linspace(0.9, 3.1, size), np.full(size, HEIGHT_M)], axis=1)
-    paths = (paths_between(emitters, microphones) for emitters in (source, loudspeakers))
-    return Room(source, loudspeakers, microphones, *paths)
+    secondary, primary = (paths_between(emitters, microphones) for emitters in (loudspeakers, source))
+    return Room(source, loudspeakers, microphones, Plant(secondary, primary, fs=FS))
 
 
 def paths_between(emitters_m: np.ndarray, microphones_m: np.ndarray) -> np.ndarray:
@@ -112,8 +109,8 @@ def places() -> dict[str, Place]:
     """Return the built-in rooms, and the measured one if its data are available."""
     made: dict[str, Place] = {}
     for size in SIZES:
-        room, name = built_in_room(size), f"{size} x {size}"
-        made[name] = Place(name, FS, N_TAPS, room.primary, room.secondary, _noises(FS, BAND_HZ))
+        name = f"{size} x {size}"
+        made[name] = Place(name, N_TAPS, built_in_room(size).plant, _noises(FS, BAND_HZ))
     measured = _measured_place()
     return made | ({} if measured is None else {MEASURED: measured})
 
@@ -126,7 +123,7 @@ def _measured_place() -> Place | None:
     del noises["compressor"]  # the recorded one takes its place
     for name, recording in zip(RECORDINGS, found.values(), strict=True):
         noises[name] = partial(signals.looped, recording, fs=room.fs)
-    return Place(MEASURED, room.fs, MEASURED_N_TAPS, room.primary, room.secondary, noises)
+    return Place(MEASURED, MEASURED_N_TAPS, room, noises)
 
 
 def _noises(fs: float, band_hz: tuple[float, float]) -> dict[str, Callable[[float], np.ndarray]]:
@@ -156,8 +153,7 @@ def _noises(fs: float, band_hz: tuple[float, float]) -> dict[str, Callable[[floa
 def make_rated_scene(place: Place, noise: str, duration_s: float) -> Scene:
     """Return the scene of a noise; each loudspeaker is rated at a quarter of the power that it would use unlimited."""
     x = place.noises[noise](duration_s + SWITCH_ON_S)
-    own: dict[str, Any] = {"n_taps": place.n_taps, "sensor_noise_db": SENSOR_NOISE_DB, "seed": SEED, "fs": place.fs}
-    scene = unit_scene((place.primary, place.secondary), x[np.newaxis], **own)
+    scene = unit_scene(place.plant, x, n_taps=place.n_taps, sensor_noise_db=SENSOR_NOISE_DB, seed=SEED)
     free = replace(scene, rated_power=1e12)
     wanted = bound_of(free, segment_s=2 * duration_s).unconstrained.control_power
     return replace(scene, rated_power=RATED_SHARE * wanted, unconstrained_power=wanted)

@@ -14,7 +14,7 @@ from kfopc_filterpy.plot import curve_style
 from .. import bench
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
 from . import report_parts as parts
-from .cases import SWITCH_ON_S, Case, bounds_db, grid_runs, make_case, noises, paths
+from .cases import SWITCH_ON_S, Case, bounds_db, grid_runs, make_case, noises, plants
 from .rows import WindowRow, column, figures_of, grouped, worst_claim
 
 SHARES_DB = (-20.0, -15.0, -12.0, -9.0, -6.0, -3.0, 0.0)  # rated power over the unconstrained control power
@@ -56,8 +56,8 @@ class BudgetRow(WindowRow):
 
 def cases() -> list[Case]:
     """Return the cases whose paths and noise are at hand."""
-    pairs, made = paths(), noises()
-    return [case for case in CASES if case.path in pairs and case.noise in made]
+    at_hand, made = plants(), noises()
+    return [case for case in CASES if case.path in at_hand and case.noise in made]
 
 
 def planned_runs() -> int:
@@ -72,8 +72,8 @@ def main(runs: Runs) -> StudyReport:
     rows: list[BudgetRow] = []
     tuned: dict[Case, TunedAt] = {}
     for case in cases():
-        pair, noise = paths()[case.path], noises()[case.noise]
-        scenes = {seed: make_case(pair, noise(DURATION_S + SWITCH_ON_S, seed), n_taps=N_TAPS) for seed in SEEDS}
+        plant, noise = plants()[case.path], noises()[case.noise]
+        scenes = {seed: make_case(plant, noise(DURATION_S + SWITCH_ON_S, seed), n_taps=N_TAPS) for seed in SEEDS}
         signals: Any = {
             name: [getattr(scene, name)[0] for scene in scenes.values()] for name in ("references", "disturbances")
         }

@@ -85,7 +85,9 @@ def legend_of(figure: Any, axes: Any) -> None:
 
 def ceiling_note(scene: Scene) -> str:
     """Return the ceiling of every constrained algorithm as a sentence."""
-    bound = power_constrained_solution(*scene.settled, scene.secondary, scene.n_taps, scene.rated_power)
+    x, d = scene.settled
+    n_taps, rated_power = scene.n_taps, scene.rated_power
+    bound = power_constrained_solution(x, scene.plant, n_taps=n_taps, rated_power=rated_power, disturbance=d)
     return (
         f"The ceiling: within the rated power a fixed filter of {scene.n_taps} taps reaches {bound.noise_reduction_db:.2f} "
         "dB with a linear amplifier (power-constrained Wiener solution)."

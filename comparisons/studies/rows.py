@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power
+from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.metrics import overshoot
 
 from ..bench import Claim, Table
@@ -52,8 +52,8 @@ def figures_of(result: SimulationResult | None, rated_power: float) -> dict[str,
     if result is None or result.diverged_at_s is not None:
         return {"diverged_at_s": 0.0 if result is None else result.diverged_at_s}
     return {
-        "noise_reduction_db": noise_reduction_db(result.error, result.disturbance),
-        "power": output_power(result.control_signal) / rated_power,
+        "noise_reduction_db": result.noise_reduction_db,
+        "power": result.output_power / rated_power,
         "worst_window": overshoot(result.control_signal, rated_power, FS, window_s=WINDOW_S),
     }
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, SimulationResult, bandpass_path, plot
+from kfopc_filterpy import HardClipAmplifier, Plant, SimulationResult, bandpass_path, plot
 from kfopc_filterpy.bounds import wiener_solution
-from kfopc_filterpy.metrics import noise_reduction_db, output_power, peak_control_signal
+from kfopc_filterpy.metrics import peak_control_signal
 from kfopc_filterpy.signals import tone
 
 from .. import bench
@@ -45,15 +45,9 @@ def planned_runs() -> int:
 def main(runs: Runs) -> StudyReport:
     """Run the study."""
     primary, secondary = bandpass_path(128, fs=FS), bandpass_path(32, fs=FS)
-    scene = bench.make_scene(
-        {0: tone(TONE_HZ, DURATION_S, fs=FS)},
-        *(primary, secondary),
-        fs=FS,
-        rated_power=RATED_POWER,
-        power_multiple=POWER_MULTIPLE,
-        n_taps=N_TAPS,
-        amplifier=HardClipAmplifier(LIMIT),
-    )
+    plant = Plant(secondary, primary, amplifier=HardClipAmplifier(LIMIT))
+    x = tone(TONE_HZ, DURATION_S, fs=FS)
+    scene = bench.make_scene({0: x}, plant, rated_power=RATED_POWER, power_multiple=POWER_MULTIPLE, n_taps=N_TAPS)
     tuned = bench.tune(runs, scene)
 
     def run_all(settings: Mapping[str, Setting]) -> dict[str, SimulationResult]:
@@ -62,7 +56,8 @@ def main(runs: Runs) -> StudyReport:
     results = run_all({name: best.setting for name, best in tuned.items()})
     forgetful, unforgetting = (run_all(dict.fromkeys(KALMAN, setting)) for setting in (FORGETFUL, UNFORGETTING))
     merits = {name: bench.figures_of_merit([result], scene, tone_hz=TONE_HZ) for name, result in results.items()}
-    optimal_weight = float(np.abs(wiener_solution(*scene.settled, scene.secondary, scene.n_taps).weights).max())
+    x, d = scene.settled
+    optimal_weight = float(np.abs(wiener_solution(x, scene.plant, n_taps=N_TAPS, disturbance=d).weights).max())
     pairs = {tuned["KF-ANC"].setting: results, FORGETFUL: forgetful}
     growths = {setting: [growth_of(pair[name], optimal_weight) for name in KALMAN] for setting, pair in pairs.items()}
     sweep = _overdrive_sweep(runs, scene, tuned)
@@ -114,8 +109,8 @@ def _extremes(result: SimulationResult, optimal_weight: float) -> dict[str, floa
         "largest_weight_over_optimal": growth.over_optimal,
         "weight_growth": growth.over_half,
         "peak_control_signal": peak_control_signal(result.control_signal, steady=1.0),
-        "output_power": output_power(result.control_signal),
-        "noise_reduction_db": noise_reduction_db(result.error, result.disturbance),
+        "output_power": result.output_power,
+        "noise_reduction_db": result.noise_reduction_db,
     }
 
 
@@ -125,13 +120,12 @@ def _overdrive_sweep(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> dict[
     In decibels a louder noise is the same as a smaller amplifier, so all levels share the gains of one reference.
     """
     powers = scene.unconstrained_power / 10 ** (OVERDRIVES_DB / 10)
-    amplifiers = [HardClipAmplifier(float(np.sqrt(2 * power))) for power in powers]
+    smaller = [replace(scene, rated_power=float(power)) for power in powers]
+    amplified = [replace(one, amplifier=HardClipAmplifier(one.amplitude_limit)).plant for one in smaller]
 
     def reductions(name: str) -> list[float]:
-        smaller = [replace(scene, rated_power=float(power)) for power in powers]
-        controllers = [bench.make_controller(budget, name, tuned[name].setting) for budget in smaller]
-        results = scene.run_together(controllers, amplifier=amplifiers)
-        return [noise_reduction_db(result.error, result.disturbance) for result in results]
+        controllers = [bench.make_controller(one, name, tuned[name].setting) for one in smaller]
+        return [result.noise_reduction_db for result in scene.run_together(controllers, plants=amplified)]
 
     values = runs.map(reductions, KALMAN, worth=lambda name: len(OVERDRIVES_DB))
     return dict(zip(KALMAN, np.array(values), strict=True))

@@ -52,12 +52,12 @@ def planned_runs() -> int:
 
 def main(runs: Runs) -> StudyReport:
     """Run the study on all ducts at hand."""
-    pairs = ducts()
+    plants = ducts()
     rows: list[TrackingRow] = []
     courses: dict[str, dict[str, dict[str, Course]]] = {}  # by event, path and algorithm
     tuned, first = {}, {}
-    for event, path in events.jobs(pairs):
-        scenes = events.scenes_of(event, pairs[path])
+    for event, path in events.jobs(plants):
+        scenes = events.scenes_of(event, plants[path])
         best = cases.tune_all(runs, scenes[0], cases.grids(ALGORITHMS))  # on the first seed
         outcomes = runs.map(partial(run_event, event, path, scenes, best), ALGORITHMS)
         rows += [row for row, _ in outcomes]
@@ -102,7 +102,7 @@ def main(runs: Runs) -> StudyReport:
         claims=claims(rows),
         figures=[_figure(event, courses[event.name]) for event in events.all_events()],
         notes=[
-            *parts.without_measured(pairs),
+            *parts.without_measured(plants),
             "An algorithm that reduces the noise by little is soon back within 3 dB of its steady NSE: compare settling "
             "times only together with the noise reduction. During a jump of +20 dB the budget allows less than 1 dB, so "
             "the constrained algorithms count as settled whatever they do.",

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kfopc_filterpy.paths import Duct, duct_paths, path_taps
+from kfopc_filterpy import Plant
+from kfopc_filterpy.paths import Duct, duct_plant
 
 from ..bench import Scene
-from .cases import FS, SEED, SWITCH_ON_S, Pair, changing, driven_case, noise_of
+from .cases import FS, SEED, SWITCH_ON_S, driven_case, heard_on, jumping, noise_of
 
 OVERDRIVE_DB = 3.0
 LOUDER, SOFTER = "20 dB louder", "20 dB softer"
@@ -29,13 +30,13 @@ SWEEP_NSE_S = 0.01
 
 @dataclass(frozen=True)
 class Event:
-    """A run in which something changes: its scene from paths and a seed, and the stretches in which the filter settles.
+    """A run in which something changes: its scene from a plant and a seed, and the stretches in which the filter settles.
 
     A stretch ends with the next change. Sweeps have none: the noise never comes to rest.
     """
 
     name: str
-    scene: Callable[[Pair, int], Scene]
+    scene: Callable[[Plant, int], Scene]
     stretches: dict[str, tuple[float, float]]
     paths: tuple[str, ...] | None = None  # None: all
     seeds: tuple[int, ...] | None = None  # None: SEEDS
@@ -49,13 +50,15 @@ def all_events() -> list[Event]:
     back = {"back": (JUMP_S[1], JUMP_RUN_S)}
     changed = {"changed": (CHANGE_S, CHANGE_RUN_S)}
     return [
-        Event(LOUDER, lambda pair, seed: jump_scene(pair, seed, JUMP_DB), {"louder": JUMP_S} | back),
-        Event(SOFTER, lambda pair, seed: jump_scene(pair, seed, -JUMP_DB), {"softer": JUMP_S} | back),
-        Event("sign", lambda pair, seed: change_scene(pair, seed, -pair[0]), changed),
-        Event("delay", lambda pair, seed: change_scene(pair, seed, np.pad(pair[0], (DELAY_SAMPLES, 0))), changed),
-        Event("longer duct", lambda pair, seed: change_scene(pair, seed, _longer_duct()), changed, paths=("duct",)),
-        Event("one sweep", lambda pair, _: sweep_scene(pair, 1), {}, None, (SEED,), SWEEP_NSE_S, SWEEP_NSE_S, "sweep"),
-        Event("sweeps", lambda pair, _: sweep_scene(pair, SWEEPS), {}, None, (SEED,), SWEEP_NSE_S, SWEEP_S, "sweep"),
+        Event(LOUDER, lambda plant, seed: jump_scene(plant, seed, JUMP_DB), {"louder": JUMP_S} | back),
+        Event(SOFTER, lambda plant, seed: jump_scene(plant, seed, -JUMP_DB), {"softer": JUMP_S} | back),
+        Event("sign", lambda plant, seed: change_scene(plant, seed, -_primary(plant)), changed),
+        Event("delay", lambda plant, seed: change_scene(plant, seed, _delayed(_primary(plant))), changed),
+        Event("longer duct", lambda plant, seed: change_scene(plant, seed, _longer_duct()), changed, paths=("duct",)),
+        Event(
+            "one sweep", lambda plant, _: sweep_scene(plant, 1), {}, None, (SEED,), SWEEP_NSE_S, SWEEP_NSE_S, "sweep"
+        ),
+        Event("sweeps", lambda plant, _: sweep_scene(plant, SWEEPS), {}, None, (SEED,), SWEEP_NSE_S, SWEEP_S, "sweep"),
     ]
 
 
@@ -64,30 +67,31 @@ def jobs(names: Iterable[str]) -> list[tuple[Event, str]]:
     return [(event, path) for event in all_events() for path in names if event.paths is None or path in event.paths]
 
 
-def scenes_of(event: Event, pair: Pair) -> list[Scene]:
+def scenes_of(event: Event, plant: Plant) -> list[Scene]:
     """Return a scene for each seed, with a sensor noise of its own."""
     return [
-        replace(event.scene(pair, seed), seeds=[seed], nse_window_s=event.nse_window_s) for seed in event.seeds or SEEDS
+        replace(event.scene(plant, seed), seeds=[seed], nse_window_s=event.nse_window_s)
+        for seed in event.seeds or SEEDS
     ]
 
 
-def jump_scene(pair: Pair, seed: int, gain_db: float) -> Scene:
+def jump_scene(plant: Plant, seed: int, gain_db: float) -> Scene:
     """Return band noise that is louder or softer for a while; the rated power is that of its usual level."""
-    scene = driven_case(pair, noise_of("band noise", JUMP_RUN_S, seed), OVERDRIVE_DB)
-    begin, end = (t + SWITCH_ON_S for t in JUMP_S)
-    return changing(scene, pair[0], noise_level_db=[(0.0, 0.0), (begin, gain_db), (end, 0.0)])
+    scene = driven_case(plant, noise_of("band noise", JUMP_RUN_S, seed), OVERDRIVE_DB)
+    begin_s, end_s = JUMP_S
+    return jumping(scene, plant, (begin_s + SWITCH_ON_S, end_s + SWITCH_ON_S), gain_db)
 
 
-def change_scene(pair: Pair, seed: int, other: np.ndarray) -> Scene:
+def change_scene(plant: Plant, seed: int, other: np.ndarray) -> Scene:
     """Return band noise whose primary path changes at `CHANGE_S`: what is on its way then arrives by the new one."""
-    scene = driven_case(pair, noise_of("band noise", CHANGE_RUN_S, seed), OVERDRIVE_DB)
-    return changing(scene, [(0.0, pair[0]), (CHANGE_S + SWITCH_ON_S, other)])
+    scene = driven_case(plant, noise_of("band noise", CHANGE_RUN_S, seed), OVERDRIVE_DB)
+    return heard_on(scene, plant.changed_at(CHANGE_S + SWITCH_ON_S, primary=other), scene.references[0])
 
 
-def sweep_scene(pair: Pair, sweeps: int) -> Scene:
+def sweep_scene(plant: Plant, sweeps: int) -> Scene:
     """Return sweeps from a standing start: silence until the control is switched on."""
     silence = np.zeros(round(SWITCH_ON_S * FS))
-    return driven_case(pair, np.concatenate([silence, np.tile(sweep(CHIRP_HZ, SWEEP_S, FS), sweeps)]), OVERDRIVE_DB)
+    return driven_case(plant, np.concatenate([silence, np.tile(sweep(CHIRP_HZ, SWEEP_S, FS), sweeps)]), OVERDRIVE_DB)
 
 
 def sweep(band_hz: tuple[float, float], duration_s: float, fs: float) -> np.ndarray:
@@ -98,4 +102,13 @@ def sweep(band_hz: tuple[float, float], duration_s: float, fs: float) -> np.ndar
 
 
 def _longer_duct() -> np.ndarray:
-    return path_taps(duct_paths(Duct(length_m=OTHER_LENGTH_M), fs=FS).primary)
+    return _primary(duct_plant(Duct(length_m=OTHER_LENGTH_M), fs=FS))
+
+
+def _delayed(primary: np.ndarray) -> np.ndarray:
+    return np.pad(primary, (DELAY_SAMPLES, 0))
+
+
+def _primary(plant: Plant) -> np.ndarray:
+    assert plant.primary is not None
+    return plant.primary[0, 0]

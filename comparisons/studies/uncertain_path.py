@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, noise_reduction_db
-from kfopc_filterpy.controllers.posterior import DEFAULT_UNCERTAINTY
+from kfopc_filterpy import Plant, SimulationResult, noise_reduction_db
+from kfopc_filterpy.controllers.kf_pb import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance, identify_secondary_path, path_taps, perturbed_path
 from kfopc_filterpy.signals import band_limited_noise, tone
 
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
 from . import cases
 from . import report_parts as parts
-from .cases import FS, SEED, SENSOR_NOISE_DB, SWITCH_ON_S, Noise, Pair, noises, paths
+from .cases import FS, SEED, SENSOR_NOISE_DB, SWITCH_ON_S, Noise, noises, plants
 from .rows import WindowRow, column, figure_table, figures_of, grouped, select, worst_claim
 
 ALGORITHM = "KF-PB"
@@ -60,18 +60,18 @@ class AllowanceRow(WindowRow):
 
 def planned_runs() -> int:
     """Return the number of runs of the study."""
-    return len(paths()) * len(study_noises()) * (cases.grid_runs([ALGORITHM]) + len(jobs()))
+    return len(plants()) * len(study_noises()) * (cases.grid_runs([ALGORITHM]) + len(jobs()))
 
 
 def main(runs: Runs) -> StudyReport:
-    """Run the study on all paths and noises at hand."""
-    pairs = paths()
+    """Run the study on all plants and noises at hand."""
+    at_hand = plants()
     rows: list[AllowanceRow] = []
     settings = {}
-    for path, pair in pairs.items():
-        estimates = known_paths(pair)
+    for path, plant in at_hand.items():
+        estimates = known_paths(plant)
         for noise, make in study_noises().items():
-            scene = cases.make_case(pair, make(DURATION_S + SWITCH_ON_S, SEED), n_taps=N_TAPS)
+            scene = cases.make_case(plant, make(DURATION_S + SWITCH_ON_S, SEED), n_taps=N_TAPS)
             scene = replace(scene, rated_power=RATED_SHARE * scene.unconstrained_power)
             best = cases.tune_all(runs, scene, cases.grids([ALGORITHM]))
             settings[f"{path}, {noise}"] = parts.tuned_in_words(best)
@@ -99,7 +99,7 @@ def main(runs: Runs) -> StudyReport:
         },
         claims=claims(rows),
         figures=[_figure(rows)],
-        notes=[*parts.without_measured(pairs), _power_note(rows), "There is one seed and one record for each case."],
+        notes=[*parts.without_measured(at_hand), _power_note(rows), "There is one seed and one record for each case."],
         tables=[
             louder_table(rows),
             _table(rows, "worst", "Least noise reduction in dB over any second after the first", "worst_second_db"),
@@ -120,13 +120,12 @@ def study_noises() -> dict[str, Noise]:
     }
 
 
-def known_paths(pair: Pair) -> dict[str, Knowledge]:
+def known_paths(plant: Plant) -> dict[str, Knowledge]:
     """Return the estimates of the secondary path, by what is wrong with them."""
-    secondary = pair[1]
+    secondary = plant.secondary[0, 0]
     std = float(np.sqrt(np.sum(secondary**2)) * 10 ** (SENSOR_NOISE_DB / 20))
-    found = identify_secondary_path(
-        secondary, fs=FS, n_taps=secondary.size, duration_s=IDENTIFICATION_S, sensor_noise_std=std, rng=SEED
-    )
+    noisy = Plant(secondary, fs=FS, sensor_noise_std=std)
+    found = identify_secondary_path(noisy, n_taps=secondary.size, duration_s=IDENTIFICATION_S, rng=SEED)
     wrong = {error: path_taps(perturbed_path(secondary, fs=FS, **own)) for error, own in ERRORS.items()}
     return {
         EXACT: (secondary, None),

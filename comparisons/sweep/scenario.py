@@ -12,6 +12,7 @@ import numpy as np
 
 from kfopc_filterpy import (
     HardClipAmplifier,
+    Plant,
     SimulationResult,
     SoftSaturationAmplifier,
     clipped_fraction,
@@ -25,9 +26,9 @@ from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot.style import decibels
 from kfopc_filterpy.verdict.runs import AllDivergedError
 
-from ..bench import Runs, Scene, algorithms, make_controller, run_setting, tune
+from ..bench import Runs, Scene, algorithms, run_setting, tune
 from ..studies import cases
-from ..studies.cases import FS, SWITCH_ON_S, WINDOW_S, Pair, Setting
+from ..studies.cases import FS, SWITCH_ON_S, WINDOW_S, Setting
 
 DEFAULTS: dict[str, Any] = {
     "path": "duct",
@@ -51,12 +52,11 @@ AMPLIFIERS: dict[str, Callable[[float], Any]] = {  # of the amplitude limit
     "soft": SoftSaturationAmplifier,
 }
 CHOICES = {
-    "path": (*cases.modelled_paths(), "measured duct"),
+    "path": (*cases.modelled_plants(), "measured duct"),
     "noise": (*cases.made_noises(), "motor"),
     "algorithm": tuple(algorithms()),
     "amplifier": tuple(AMPLIFIERS),
 }
-UNCONSTRAINED_POWER = 1.0  # of every scene; it sets the scale of the divergence limit
 TUNING_SEED = 0  # of the noise on which settings are tuned; those of a sweep begin with 1
 MEASURES: dict[str, Callable[[SimulationResult, Scene], float]] = {
     "noise_reduction_db": lambda run, scene: noise_reduction_db(run.error, run.disturbance),
@@ -95,9 +95,7 @@ def in_the_loop(values: Mapping[str, Any]) -> dict[str, Any]:
         return {"diverged": True}
     used = dict(zip(("setting_used", "second_setting_used"), np.atleast_1d(setting).tolist(), strict=False))
     scene = scene_of(values)
-    controller = make_controller(scene, algorithm, setting)
-    scaled = replace(scene, rated_power=UNCONSTRAINED_POWER)
-    result = run_setting(scaled, algorithm, setting, controller=controller)
+    result = run_setting(scene, algorithm, setting)
     if result is None or result.diverged_at_s is not None:
         return used | {"diverged": True}
     return {name: measure(result, scene) for name, measure in MEASURES.items()} | used | {"diverged": False}
@@ -122,20 +120,21 @@ def _noise_scene(path: str, noise: str, duration_s: float, n_taps: int, sensor_n
     """Return the scene of one noise, of unconstrained control power 1."""
     made = cases.made_noises()
     signal = (made if noise in made else _measured(cases.noises(), noise))[noise](duration_s + SWITCH_ON_S, seed)
-    return cases.make_case(_path_pair(path), signal, n_taps=n_taps, sensor_noise_db=sensor_noise_db, seed=seed)
+    return cases.make_case(_plant(path), signal, n_taps=n_taps, sensor_noise_db=sensor_noise_db, seed=seed)
 
 
 @lru_cache(maxsize=256)  # a phase is fitted by least squares: seconds for a long path
 def _estimated_path(path: str, gain_db: float, delay: float, phase_deg: float) -> np.ndarray:
-    taps = _path_pair(path)[1]
+    taps = _plant(path).secondary[0, 0]
     if not (gain_db or delay or phase_deg):
         return taps
     return path_taps(perturbed_path(taps, fs=FS, gain_db=gain_db, delay_samples=delay, phase_deg=phase_deg))
 
 
-def _path_pair(name: str) -> Pair:
-    modelled = cases.modelled_paths()
-    return (modelled if name in modelled else _measured(cases.paths(), name))[name]
+def _plant(name: str) -> Plant:
+    modelled = cases.modelled_plants()
+    plant: Plant = (modelled if name in modelled else _measured(cases.plants(), name))[name]
+    return plant
 
 
 def _measured(found: Mapping[str, Any], name: str) -> Mapping[str, Any]:
