@@ -16,16 +16,15 @@ from matplotlib.figure import Figure
 
 from kfopc_filterpy import (
     HardClipAmplifier,
+    Plant,
     kf_anc,
     kf_opc,
     kf_pb,
-    noise_reduction_db,
-    output_power,
     power_constrained_wiener,
     simulate,
 )
-from kfopc_filterpy.bounds import wiener_solution
-from kfopc_filterpy.paths import duct_paths, path_taps
+from kfopc_filterpy.bounds import WienerSolution, wiener_solution
+from kfopc_filterpy.paths import duct_plant
 from kfopc_filterpy.plot import curve_style
 from kfopc_filterpy.signals import band_limited_noise
 
@@ -45,21 +44,20 @@ class Overload:
     duration_s: float = 6.0
 
     @cached_property
-    def duct(self):
-        """Primary and secondary path."""
-        return duct_paths(fs=FS)
+    def duct(self) -> Plant:
+        """The duct with a linear amplifier."""
+        return duct_plant(fs=FS)
 
     @cached_property
-    def signals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Reference and disturbance."""
-        x = band_limited_noise((100, 1200), self.duration_s, fs=FS, rng=3)
-        return x, np.convolve(x, path_taps(self.duct.primary))[: x.size]
+    def x(self) -> np.ndarray:
+        """Reference."""
+        return band_limited_noise((100, 1200), self.duration_s, fs=FS, rng=3)
 
     @cached_property
-    def full_control(self):
+    def full_control(self) -> WienerSolution:
         """The best fixed filter without a constraint; its power is the rated power of 0 dB."""
-        x, d = (signal[int(SWITCH_ON_S * FS) :] for signal in self.signals)
-        return wiener_solution(x, d, self.duct.secondary, TAPS)
+        x, d = (signal[int(SWITCH_ON_S * FS) :] for signal in (self.x, self.duct.disturbance(self.x)))
+        return wiener_solution(x, self.duct, n_taps=TAPS, disturbance=d)
 
     def rated_power(self, level_db: float) -> float:
         """Rated power that the noise exceeds by a level."""
@@ -69,34 +67,28 @@ class Overload:
     def settings(self) -> dict[str, float]:
         """Settings of KF-ANC and KF-OPC: those of the tutorial on the constraint factor."""
         q = 1e-3 * self.full_control.disturbance_power
-        variance = self.full_control.control_power / (TAPS * np.mean(self.signals[0] ** 2))
+        variance = self.full_control.control_power / (TAPS * np.mean(self.x**2))
         return {"state_noise": 1e-8 * q, "measurement_noise": q, "initial_variance": float(variance)}
 
     def run(self, algorithm: str, level_db: float) -> tuple[float, float]:
         """Noise reduction in dB, and power of the control signal over the rated power, in the second half of a run."""
-        rated, s = self.rated_power(level_db), self.duct.secondary
+        rated = self.rated_power(level_db)
+        plant = Plant(self.duct.secondary, self.duct.primary, amplifier=HardClipAmplifier(2 * rated**0.5), fs=FS)
         if algorithm == "KF-ANC":
-            controller = kf_anc(TAPS, s, **self.settings)
+            controller = kf_anc(TAPS, plant, **self.settings)
+        elif algorithm == "KF-OPC":
+            controller = kf_opc(TAPS, plant, rated_power=rated, **self.settings)
         else:
-            controller = (
-                kf_pb(TAPS, s, rated_power=rated, fs=FS)
-                if algorithm == "KF-PB"
-                else kf_opc(TAPS, s, rated_power=rated, **self.settings)
-            )
-        x, d = self.signals
-        result = simulate(
-            controller, x, disturbance=d, secondary_path=s, amplifier=HardClipAmplifier(2 * rated**0.5), fs=FS,
-            rated_power=rated, switch_on_s=SWITCH_ON_S,
-        )  # fmt: skip
-        return noise_reduction_db(result.error, result.disturbance), output_power(result.control_signal) / rated
+            controller = kf_pb(TAPS, plant, rated_power=rated)
+        run = simulate(controller, self.x, plant, switch_on_s=SWITCH_ON_S)
+        return run.noise_reduction_db, float(run.output_power) / rated
 
     def bound(self, level_db: float) -> float:
         """Noise reduction in dB of the best fixed filter within the rated power, in the second half of the run."""
-        x, d = self.signals
-        ridge = self.settings["measurement_noise"] / (x.size * self.settings["initial_variance"])
+        ridge = self.settings["measurement_noise"] / (self.x.size * self.settings["initial_variance"])
         rated = self.rated_power(level_db)
         best = power_constrained_wiener(
-            x, d, self.duct.secondary, TAPS, rated_power=rated, fs=FS, switch_on_s=SWITCH_ON_S, ridge=ridge
+            self.x, self.duct, n_taps=TAPS, rated_power=rated, switch_on_s=SWITCH_ON_S, ridge=ridge
         )
         return float(best.noise_reduction_over(0.5 * best.whole.end_s)["whole"])
 

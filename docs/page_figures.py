@@ -15,12 +15,10 @@ from matplotlib.figure import Figure
 from scipy.signal import lfilter
 
 from kfopc_filterpy import (
-    OutputPowerConstraint,
+    Plant,
     SimulationResult,
     kf_opc,
     kf_pb,
-    noise_reduction_db,
-    output_power,
     power_constrained_wiener,
     simulate,
 )
@@ -41,29 +39,25 @@ Reduction = dict[str, list[float]]
 class WeakLoudspeaker:
     """The example of the page on constraints: a loudspeaker that is weak at low frequencies."""
 
-    secondary = np.array([0.0, 0.0, 0.0, 1.0, -0.8])
+    plant = Plant([0.0, 0.0, 0.0, 1.0, -0.8], primary=np.eye(60)[40], fs=FS)
 
     def __init__(self, duration_s: float = 4.0) -> None:
         self.x = band_limited_noise((100, 2000), duration_s, fs=FS, rng=1)
-        self.d = np.convolve(self.x, np.eye(60)[40])[: self.x.size]
 
     def bound(self, rated_power: float) -> PowerConstrainedWiener:
         """Return the best filters of a power."""
         return power_constrained_wiener(
-            self.x, self.d, self.secondary, 160, rated_power=rated_power, fs=FS, switch_on_s=0.5, ridge=1e-6
+            self.x, self.plant, n_taps=160, rated_power=rated_power, switch_on_s=0.5, ridge=1e-6
         )
 
     def runs(self) -> dict[str, SimulationResult]:
         """Return the runs of two controllers of the same rated power."""
         settings: dict[str, Any] = {"state_noise": 1e-9, "measurement_noise": 1e-3, "initial_variance": 0.1}
-        controllers = (
-            kf_opc(160, self.secondary, rated_power=RATED_POWER, **settings),
-            kf_pb(160, self.secondary, rated_power=RATED_POWER),
-        )
-        results = (
-            simulate(c, self.x, disturbance=self.d, secondary_path=self.secondary, switch_on_s=0.5) for c in controllers
-        )
-        return {result.algorithm: result for result in results}
+        controllers = [
+            kf_opc(160, self.plant, rated_power=RATED_POWER, **settings),
+            kf_pb(160, self.plant, rated_power=RATED_POWER),
+        ]
+        return {run.algorithm: run for run in simulate(controllers, self.x, self.plant, switch_on_s=0.5)}
 
 
 def constraint() -> Figure:
@@ -74,10 +68,9 @@ def constraint() -> Figure:
     ax = figure.subplots()
     ax.plot(POWERS, [bound.whole.noise_reduction_db for bound in bounds], "k-", label="bound")
     ax.plot(POWERS, [bound.scaled.noise_reduction_db for bound in bounds], "k--", label="best filter, scaled")
-    for name, result in example.runs().items():
-        power = output_power(result.control_signal) / RATED_POWER
+    for name, run in example.runs().items():
         style = curve_style(name) | {"linestyle": "none", "markersize": 9}
-        ax.plot(power, noise_reduction_db(result.error, result.disturbance), label=name, **style)
+        ax.plot(run.output_power / RATED_POWER, run.noise_reduction_db, label=name, **style)
     ax.axvline(1.0, color="0.6", linewidth=1)
     ax.set(xlabel="Output power / rated power", ylabel="Noise reduction (dB)")
     ax.legend(frameon=False)
@@ -88,6 +81,7 @@ def constraint() -> Figure:
 def delayed_estimates(delays: Sequence[float] = DELAYS, duration_s: float = 5.0) -> Reduction:
     """Return the noise reduction by controller, one for each delay error of the estimated path."""
     secondary, primary, rate = np.array([0.0, 0.0, 0.0, 1.0, -0.6]), np.eye(10)[8] * 0.8 + np.eye(10)[9] * 0.4, 8000.0
+    plant = Plant(secondary, primary, fs=rate)
     x = np.random.default_rng(1).standard_normal(int(duration_s * rate))
     tolerances = {
         "KF-OPC, taken as exact": None,
@@ -99,13 +93,10 @@ def delayed_estimates(delays: Sequence[float] = DELAYS, duration_s: float = 5.0)
         estimate = path_taps(perturbed_path(secondary, fs=rate, delay_samples=delay)) if delay else secondary
         controllers: dict[str, Any] = {"KF-PB": kf_pb(24, estimate, rated_power=0.3, fs=rate)}
         for name, tolerance in tolerances.items():
-            controllers[name] = kf_opc(
-                24, estimate, constraint=OutputPowerConstraint(0.3, fs=rate), state_noise=1e-9, measurement_noise=1e-3
-            )
+            controllers[name] = kf_opc(24, estimate, rated_power=0.3, fs=rate, state_noise=1e-9, measurement_noise=1e-3)
             controllers[name].secondary_path_uncertainty = tolerance
         for name, controller in controllers.items():
-            result = simulate(controller, x, primary_path=primary, secondary_path=secondary, fs=rate)
-            found[name].append(noise_reduction_db(result.error, result.disturbance))
+            found[name].append(simulate(controller, x, plant).noise_reduction_db)
     return found
 
 
@@ -128,17 +119,17 @@ def predictions(delays: Sequence[int] = range(9), duration_s: float = 10.0) -> R
     half = d[d.size // 2 :]
     found: Reduction = {name: [] for name in ("closed form", "bound", "KF-PB", "KF-OPC")}
     for delay in delays:
-        path, limit = np.eye(delay + 1)[delay], OutputPowerConstraint(rated, fs=rate)
-        bound = power_constrained_solution(predictor_reference(half), half, path, 8, rated)
+        plant = Plant(np.eye(delay + 1)[delay], fs=rate)
+        bound = power_constrained_solution(
+            predictor_reference(half), plant, n_taps=8, rated_power=rated, disturbance=half
+        )
         controllers = (
-            kf_pb(8, path, rated_power=rated, fs=rate, averaging_s=1.0),
-            kf_opc(8, path, constraint=limit, state_noise=1e-12, measurement_noise=0.3),
+            kf_pb(8, plant, rated_power=rated, averaging_s=1.0),
+            kf_opc(8, plant, rated_power=rated, state_noise=1e-12, measurement_noise=0.3),
         )
-        runs = (
-            simulate(with_internal_model(c), None, disturbance=d, secondary_path=path, fs=rate) for c in controllers
-        )
+        runs = simulate([with_internal_model(c) for c in controllers], None, plant, disturbance=d)
         best = -10 * np.log10(1 - pole ** (2 * (delay + 1)))
-        reached = [noise_reduction_db(run.error, run.disturbance) for run in runs]
+        reached = [run.noise_reduction_db for run in runs]
         for own, value in zip(found.values(), (best, bound.noise_reduction_db, *reached), strict=True):
             own.append(value)
     return found

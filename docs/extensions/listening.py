@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import FxNLMS, OutputPowerConstraint, kf_anc, kf_opc, kf_pb
+from kfopc_filterpy import fx_nlms, kf_anc, kf_opc, kf_pb
 from kfopc_filterpy.core.building import FLAGS, FOLDER
 from kfopc_filterpy.export.joined import sources_of
-from kfopc_filterpy.paths import Duct, duct_paths, path_taps
+from kfopc_filterpy.paths import Duct, duct_plant
 from kfopc_filterpy.signals import band_limited_noise
 
 PAGE = Path(__file__).resolve().parents[1] / "listen"
@@ -49,14 +49,13 @@ def scene() -> dict[str, Any]:
     """Return the noise, the paths and the controllers of the page."""
     noise = band_limited_noise(BAND_HZ, SECONDS, fs=float(FS), rng=3)
     integers = np.round(PEAK * 32767 * noise / np.abs(noise).max()).astype("<i2")
-    paths = duct_paths(Duct(reflection=(0.2, -0.1)), fs=float(FS))
-    primary, secondary = path_taps(paths.primary), path_taps(paths.secondary)
+    plant = duct_plant(Duct(reflection=(0.2, -0.1)), fs=FS)
     controllers = {
         "off": (0, None),
-        "FxNLMS": (1, FxNLMS(TAPS, secondary, step_size=0.01)),
-        "plain Kalman filter": (2, kf_anc(TAPS, secondary, **NOISES)),
-        "KF-OPC": (3, kf_opc(TAPS, secondary, rated_power=1.0, **NOISES)),
-        "KF-PB": (4, kf_pb(TAPS, secondary, rated_power=1.0, fs=float(FS))),
+        "FxNLMS": (1, fx_nlms(TAPS, plant, step_size=0.01)),
+        "plain Kalman filter": (2, kf_anc(TAPS, plant, **NOISES)),
+        "KF-OPC": (3, kf_opc(TAPS, plant, rated_power=1.0, **NOISES)),
+        "KF-PB": (4, kf_pb(TAPS, plant, rated_power=1.0)),
     }
     defaults: dict[str, float] = {}
     chosen: dict[str, dict[str, Any]] = {}
@@ -65,16 +64,16 @@ def scene() -> dict[str, Any]:
         chosen[name] = {"which": which, "settings": list(settings)}
         defaults |= settings
     rates = {}
-    for fs in map(float, RATES):
-        of_budget = settings_of(kf_pb(TAPS, secondary, rated_power=1.0, fs=fs))
-        constrained = kf_opc(TAPS, secondary, constraint=OutputPowerConstraint(1.0, fs=fs), **NOISES)
-        rates[int(fs)] = {name: of_budget[name] for name in ("block", "averaging", "window")}
-        rates[int(fs)]["rate"] = float(constrained._block.fields["constraint"].ravel()[1])
+    for fs in RATES:
+        of_budget = settings_of(kf_pb(TAPS, plant.secondary[0, 0], rated_power=1.0, fs=fs))
+        constrained = kf_opc(TAPS, plant.secondary[0, 0], rated_power=1.0, fs=fs, **NOISES)
+        rates[fs] = {name: of_budget[name] for name in ("block", "averaging", "window")}
+        rates[fs]["rate"] = float(constrained._block.fields["constraint"].ravel()[1])
     return {
         "fs": FS,
         "noise": base64.b64encode(integers.tobytes()).decode(),
-        "primary": primary.astype(np.float32).tolist(),
-        "secondary": secondary.astype(np.float32).tolist(),
+        "primary": plant.primary[0, 0].astype(np.float32).tolist(),
+        "secondary": plant.secondary[0, 0].astype(np.float32).tolist(),
         "controllers": chosen,
         "defaults": defaults,
         "rates": rates,

@@ -29,6 +29,7 @@ NAMESPACES = (
 )
 
 TASKS = {  # what the names of a folder are for
+    "plant": "Describe a plant",
     "loop": "Simulate a run",
     "controllers": "Choose a controller, or write one",
     "filters": "Extend filterpy",

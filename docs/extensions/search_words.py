@@ -7,8 +7,7 @@ from typing import Any
 WORDS = {
     "install": ("install", "pip", "Windows", "macOS", "requirements"),
     "index": ("cite", "licence"),
-    "formats": ("WAV", "MATLAB", "CSV", "SOFA", "HDF5", "sample rate", "recording"),
-    "guide": ("save", "checkpoint", "simulate"),
+    "formats": ("save", "checkpoint", "WAV", "MATLAB", "CSV", "SOFA", "HDF5", "sample rate", "recording"),
     "constraint": ("rated power", "limiter", "constraint factor"),
     "limits": ("limitations", "diverges"),
     "algorithms": ("FxLMS", "RLS", "algorithm"),
