@@ -99,7 +99,7 @@ class Twins(RuleBasedStateMachine):
 
     # A sample: a prediction and a correction of any form, and between them what a user does with the filter.
 
-    @rule(seed=seeds, samples=st.integers(1, 8))
+    @rule(seed=seeds, samples=st.integers(1, 40))
     def steps(self, seed: int, samples: int) -> None:
         """What is written into an array that was kept from before counts if no step was taken since, and only then."""
         rng = np.random.default_rng(seed)
@@ -354,5 +354,5 @@ class RandomWalk(Twins):
 
 TestGeneral, TestRandomWalk = General.TestCase, RandomWalk.TestCase
 TestGeneral.settings = TestRandomWalk.settings = settings(
-    max_examples=200, stateful_step_count=20, report_multiple_bugs=False
+    max_examples=150, stateful_step_count=20, report_multiple_bugs=False
 )

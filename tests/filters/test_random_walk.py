@@ -103,8 +103,8 @@ def test_predictions_err_by_a_rounding_of_P0_at_most(kind: str, P0: float, r: fl
     assert np.linalg.eigvalsh(ours.P).min() > 0
 
 
-@pytest.mark.parametrize("band", [(250.0, 350.0), (200.0, 2000.0)])
-def test_p_stays_semidefinite_at_a_large_initial_variance(band: tuple[float, float]) -> None:
+@pytest.mark.parametrize(("band", "assigned"), [((250.0, 350.0), True), ((200.0, 2000.0), False)])
+def test_p_stays_semidefinite_at_a_large_initial_variance(band: tuple[float, float], assigned: bool) -> None:
     """P(0|0)/q = 1e12, no state noise: the variances along the noise are below the last digit of the others.
 
     Without the least state noise, S is negative after 2000 to 3000 samples. The innovations must stay near the measurement
@@ -113,7 +113,9 @@ def test_p_stays_semidefinite_at_a_large_initial_variance(band: tuple[float, flo
     q, taps, n = 1e-4, 32, 12000
     x = band_limited_noise(band, n / 16000.0, fs=16000.0, rng=0)
     d = 2.0 * np.roll(x, 5) + np.sqrt(q) * np.random.default_rng(1).standard_normal(n)
-    kf = KFOPC.random_walk(taps, state_noise=0.0, measurement_noise=q, initial_variance=1e12 * q)
+    kf = KFOPC.random_walk(taps, state_noise=0.0, measurement_noise=q, initial_variance=0.0 if assigned else 1e12 * q)
+    if assigned:
+        kf.P = 1e12 * q
     innovations = []
     for k in range(taps, n):
         kf.predict()
@@ -166,7 +168,13 @@ def test_what_is_written_into_P_counts_at_the_next_step_and_what_is_held_stays()
     left = kf.P.copy()
     held *= 100.0  # of an earlier step
     kf.predict()
-    np.testing.assert_array_equal(kf.P, left + 0.5 * np.eye(3))
+    predicted = kf.P.copy()
+    np.testing.assert_array_equal(predicted, left + 0.5 * np.eye(3))
+    kf.P = kf.P_post.copy()
+    kf.update(1.0, H=np.ones(3))
+    np.testing.assert_array_equal(kf.P_prior, predicted)
+    kf.update(1.0, H=np.ones(3))
+    np.testing.assert_array_equal(kf.P_prior, predicted)
 
 
 @pytest.mark.parametrize("name", ["F", "Q", "R"])
