@@ -23,7 +23,7 @@ class FastArrayKalman(OneChannel):
 
     def __init__(self, n_taps: int, secondary: np.ndarray, *, forgetting: float, initial_variance: float) -> None:
         super().__init__(n_taps, secondary)
-        self.lamda, self.root = forgetting, 1.0  # gamma^-1/2, gamma^-1 = 1 + x'^T P x' / lambda
+        self.forgetting, self.root = forgetting, 1.0  # gamma^-1/2, gamma^-1 = 1 + x'^T P x' / lambda
         self.gain, self.first, self.second = np.zeros((3, n_taps + 1))  # [g gamma^-1/2; 0], and the columns of B
         self.first[0] = np.sqrt(initial_variance)
         self.second[-1] = np.sqrt(initial_variance * forgetting**n_taps)
@@ -45,9 +45,9 @@ class FastArrayKalman(OneChannel):
         h = 1 / np.sqrt(1 - t**2)
         gain = np.concatenate(([0.0], self.gain[:-1]))
         rotated = c * gain + s * self.first
-        self.first = (c * self.first - s * gain) / np.sqrt(self.lamda)
+        self.first = (c * self.first - s * gain) / np.sqrt(self.forgetting)
         self.gain = h * (rotated - t * self.second)
-        self.second = h * (self.second - t * rotated) / np.sqrt(self.lamda)
+        self.second = h * (self.second - t * rotated) / np.sqrt(self.forgetting)
         self.root = float(norm / h)
 
     def update(self, error: float) -> None:

@@ -77,14 +77,14 @@ class SubfilterKalman(OneChannel):
         nu, V = eigh(self.R, H)
         a = V.T @ self.H @ self.g
 
-        def excess(lamda: float) -> float:
-            return float(np.sum(nu * (a / (1 + lamda * nu)) ** 2)) - self.rated_power
+        def excess(multiplier: float) -> float:
+            return float(np.sum(nu * (a / (1 + multiplier * nu)) ** 2)) - self.rated_power
 
         highest = 1.0
         while excess(highest) > 0:
             highest *= 10
-        lamda = brentq(excess, 0.0, highest) if excess(0.0) > 0 else 0.0
-        return V / (1 + lamda * nu) @ V.T @ self.H
+        multiplier = brentq(excess, 0.0, highest) if excess(0.0) > 0 else 0.0
+        return V / (1 + multiplier * nu) @ V.T @ self.H
 
     def update(self, error: float) -> None:
         """Let the gains adapt to the disturbance that an error reveals."""
