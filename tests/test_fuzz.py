@@ -217,7 +217,7 @@ def test_a_plant_and_its_changes_are_refused_or_have_finite_paths_and_a_finite_d
 
 def test_a_filter_refuses_and_stays_or_is_finite() -> None:
     for rng in rounds(60):
-        kf = KFOPC(3, 1, rated_power=1.0 if rng.random() < 0.5 else None)
+        kf = KFOPC(3, 1, rated_power=1.0 if rng.random() < 0.5 else None, fs=8000)
         kf.P *= 0.1
         for _ in range(12):
             before = deepcopy(kf)

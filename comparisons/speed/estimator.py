@@ -64,7 +64,7 @@ def random_walks(taps: int) -> dict[str, tuple[Any, Steps]]:
         filters[kind] = walk(), [(of_kind(value), row) for value, row in zip(z, flat, strict=True)]
     filters["row (1, L)"] = walk(), list(zip(z, matrix, strict=True))
     rated = [(value, {"H": row, "reference": row[0]}) for value, row in zip(z, rows, strict=True)]
-    filters["rated power"] = walk(rated_power=RATED_POWER), rated
+    filters["rated power"] = walk(rated_power=RATED_POWER, fs=16000), rated
     return filters
 
 

@@ -27,11 +27,11 @@ SMALL_BOUND_DB = 10.0  # below it, a shorter delay may be worth having
 EXAMPLES = """examples:
   kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --seconds 20
   kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --clock real --block 32
-  kfopc run --device 3 --references 0 --errors 1 --outputs 0 --rated-power 0.01 --amplitude-limit 0.5
-  kfopc run --device 3 --errors 1 --feedback --rated-power 0.01 --amplitude-limit 0.5
+  kfopc run --device 3 --references 0 --errors 1 --outputs 0 --fs 16000 --rated-power 0.01 --amplitude-limit 0.5
+  kfopc run --device 3 --errors 1 --feedback --fs 16000 --rated-power 0.01 --amplitude-limit 0.5
 
 With a recording, the plant is simulated; give several channels as for kfopc verdict. With --references and --errors, it
-is real, behind a sound card at --fs or 16000 Hz: begin with a small --amplitude-limit.
+is real, behind a sound card at the rate --fs: begin with a small --amplitude-limit.
 Ctrl-C fades the control out. exit code: 0 ended as requested, 1 stopped by a fault, 2 wrong input"""
 
 
@@ -108,11 +108,13 @@ def _sound_card(options: argparse.Namespace) -> Interface:
         )
     of_files = ("primary", "disturbance", "secondary", "microphones", "file_fs", "channel", "variable")
     refuse_unused(options, of_files, " with a sound card: leave it out, or give a recording")
+    if options.fs is None:
+        raise ValueError("the sample rate of the sound card is missing: give one that it has, for example --fs 48000")
     return SoundDevice(
         references,
         options.errors,
         options.outputs,
-        fs=options.fs or 16000.0,
+        fs=options.fs,
         block=options.block,
         device=int(options.device) if (options.device or "").isdigit() else options.device,
     )

@@ -72,9 +72,11 @@ class KFOPC(KalmanFilter, Checkpointed):
         Number of control inputs.
     rated_power : float or array_like, shape (J,), optional
         Rated output power (mean square of the control signal), or that of each of J loudspeakers. None: no constraint.
+    fs : float, optional
+        Sample rate in Hz, which a rated power needs, also one that is assigned later: its power estimates remember 0.5 s.
     constraint : OutputPowerConstraint or sequence of J of them, optional
-        Given instead of `rated_power` to set also the sample rate, the memory of the power estimates or a known
-        secondary-path gain. The filter keeps a copy. By default the gain is estimated from the newest sample of H and
+        Given instead of `rated_power` and `fs` to set also the memory of the power estimates or a known secondary-path
+        gain. The filter keeps a copy. By default the gain is estimated from the newest sample of H and
         the `reference` given to `update` (eq. 11).
 
     Attributes
@@ -90,8 +92,8 @@ class KFOPC(KalmanFilter, Checkpointed):
     TypeError
         A dimension that is not a whole number.
     ValueError
-        A dimension out of range, a `dim_x` that is not a multiple of the number of loudspeakers, a power that is not
-        positive, both a rated power and a constraint.
+        A dimension out of range, a `dim_x` that is not a multiple of the number of loudspeakers, a power or a rate that
+        is not positive, a rated power without a rate, a constraint beside one of them.
 
     See Also
     --------
@@ -129,7 +131,7 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     Two loudspeakers of two taps each, and one microphone:
 
-    >>> kf = KFOPC(dim_x=4, rated_power=[1.0, 0.25])
+    >>> kf = KFOPC(dim_x=4, rated_power=[1.0, 0.25], fs=16000)
     >>> kf.update(4.0, H=np.array([1.0, 0.0, 2.0, 0.0]), reference=1.0)
     >>> kf.secondary_path_gain
     array([1., 4.])
@@ -154,10 +156,11 @@ class KFOPC(KalmanFilter, Checkpointed):
         dim_u: int = 0,
         *,
         rated_power: PerLoudspeaker | None = None,
+        fs: float | None = None,
         constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
     ) -> None:
         self._constraint: Any = None
-        self._lifted: Any = None  # the constraint before it was lifted, for its settings
+        self._settings: Any = None  # those of the next constraint: of `fs`, or of the constraint that was lifted
         self._unconstrained_factor = 1.0
         self._moved = False  # by a control input
         self._written, self._writes = [0], 0  # steps that wrote in place, see `_require_whole`
@@ -166,11 +169,15 @@ class KFOPC(KalmanFilter, Checkpointed):
         self._equal_rows = 0  # in how many steps it has been the same, and -1 once it has changed
         super().__init__(dim_x, dim_z, dim_u)
         if constraint is not None:
-            if rated_power is not None:
-                raise ValueError("give either rated_power= or constraint=, which has a rated power, not both")
+            if rated_power is not None or fs is not None:
+                raise ValueError("give either rated_power= and fs=, or constraint=, which has both")
             self.constraint = constraint
-        else:
-            self.rated_power = rated_power
+            return
+        if fs is not None:
+            from ..power.constraint import OutputPowerConstraint
+
+            self._settings = OutputPowerConstraint(1.0, fs=fs)
+        self.rated_power = rated_power
 
     @classmethod
     def random_walk(
@@ -181,6 +188,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         measurement_noise: float,
         initial_variance: float = 1.0,
         rated_power: float | None = None,
+        fs: float | None = None,
         constraint: OutputPowerConstraint | None = None,
     ) -> RandomWalkKFOPC:
         """Return the filter of eq. 1-8 for a random-walk control filter: F = I, Q = r I, R = q, in O(L^2) per sample.
@@ -197,8 +205,8 @@ class KFOPC(KalmanFilter, Checkpointed):
             Variance of each tap before the first sample: P(0|0) = initial_variance I.
         rated_power : float, optional
             Rated output power; None: the unconstrained filter, KF-ANC.
-        constraint : OutputPowerConstraint, optional
-            Given instead of `rated_power`, as for `KFOPC`.
+        fs, constraint : optional
+            As for `KFOPC`: a rated power needs the sample rate `fs`.
 
         Returns
         -------
@@ -228,6 +236,7 @@ class KFOPC(KalmanFilter, Checkpointed):
             measurement_noise=measurement_noise,
             initial_variance=initial_variance,
             rated_power=rated_power,
+            fs=fs,
             constraint=constraint,
         )
 
@@ -409,13 +418,16 @@ class KFOPC(KalmanFilter, Checkpointed):
         powers: Any = value
         one = np.ndim(powers) == 0
         if value is None:
-            self._lifted, self._constraint = self._constraint or self._lifted, None
+            self._settings, self._constraint = self._constraint or self._settings, None
         elif self._constraint is not None and (one or isinstance(self._constraint, tuple)):
             self._constraint.rated_power = value
         else:
-            from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
-
-            settings = self._constraint or self._lifted or OutputPowerConstraint(1.0, fs=DEFAULT_FS)
+            settings = self._constraint or self._settings
+            if settings is None:
+                raise ValueError(
+                    "a rated power needs the sample rate, for its power estimates: give fs= where the filter is made, or "
+                    "assign kf.constraint = OutputPowerConstraint(rated_power, fs=...)"
+                )
             together = one or isinstance(settings, tuple)
             self.constraint = settings.fresh(powers) if together else [settings.fresh(power) for power in powers]
 

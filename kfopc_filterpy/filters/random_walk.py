@@ -69,7 +69,7 @@ class RandomWalkKFOPC(KFOPC):
 
     Parameters
     ----------
-    n_taps, state_noise, measurement_noise, initial_variance, rated_power, constraint
+    n_taps, state_noise, measurement_noise, initial_variance, rated_power, fs, constraint
         As for `KFOPC.random_walk`.
 
     Examples
@@ -101,10 +101,11 @@ class RandomWalkKFOPC(KFOPC):
         measurement_noise: float,
         initial_variance: float = 1.0,
         rated_power: float | None = None,
+        fs: float | None = None,
         constraint: OutputPowerConstraint | None = None,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
-        super().__init__(n_taps, 1, rated_power=rated_power, constraint=constraint)
+        super().__init__(n_taps, 1, rated_power=rated_power, fs=fs, constraint=constraint)
         self.Q = as_nonnegative(state_noise, "state_noise")
         self.R = as_nonnegative(measurement_noise, "measurement_noise")
         variance = as_nonnegative(initial_variance, "initial_variance")

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from .._validate import as_choice, as_nonnegative, as_number, as_positive
 from ..core.calls import commit, preview
 
-DEFAULT_FS = 16000.0
 DEFAULT_MEMORY_S = 0.5
 
 

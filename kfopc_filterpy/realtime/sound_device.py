@@ -25,8 +25,8 @@ class SoundDevice:
         Inputs of the reference and error microphones, counted from 0; ``[]`` stands for no reference microphone.
     output_channels : sequence of int, default (0,)
         Outputs of the loudspeakers. The other outputs up to the largest of them stay silent.
-    fs : float, default 16000
-        Sample rate in Hz.
+    fs : float
+        Sample rate in Hz, one that the card has.
     block : int, default 64
         Samples of a block.
     device : int, str or pair of them, optional
@@ -71,7 +71,7 @@ class SoundDevice:
         error_channels: Sequence[int],
         output_channels: Sequence[int] = (0,),
         *,
-        fs: float = 16000.0,
+        fs: float,
         block: int = 64,
         device: int | str | tuple[int | str | None, int | str | None] | None = None,
         latency: float | str = "low",

@@ -47,7 +47,14 @@ def test_the_command_shows_levels_and_returns_what_ended_it(command, tmp_path):
         ([*given, "--disturbance", given[0], *options], "--disturbance stands in place of --primary: leave out one"),
         ([*given, *options, "--device", "3"], "--device, --references and --errors do not go with a recording"),
         ([*given, *options, "--seconds", "nan"], "--seconds must be finite, got nan"),
-        (["--references", "0", "--errors", "0", *options], "references and errors must be different inputs"),
+        (
+            ["--references", "0", "--errors", "1", *options],
+            "the sample rate of the sound card is missing: give one that it",
+        ),
+        (
+            ["--references", "0", "--errors", "0", "--fs", "8000", *options],
+            "references and errors must be different inputs",
+        ),
         (["--references", "0", "x", "--errors", "1", *options], "--references must be a whole number, got 'x'"),
         ([*given, *options, "--identify", "8"], "identifying 8 s: nothing is left to control; give a longer recording"),
         ([*given[:4], given[0], *options], "noise.wav has 64000 samples (8 s)"),

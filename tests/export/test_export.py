@@ -600,7 +600,7 @@ NOT_EXPORTED = {
         r"FxLMS \(Own\) has calls of its own",
     ),
     "estimator": (
-        lambda: KalmanController(KFOPC.random_walk(4, rated_power=RATED, **NOISES), ONE_HAT),
+        lambda: KalmanController(KFOPC.random_walk(4, rated_power=RATED, fs=8000, **NOISES), ONE_HAT),
         r"KF-OPC \(KalmanController\) has calls of its own",
     ),
 }

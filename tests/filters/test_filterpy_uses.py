@@ -261,7 +261,7 @@ def test_it_is_a_filterpy_filter_with_its_signature_and_its_repr() -> None:
     for bad in ((0, 1, 0), (1, 0, 0), (1, 1, -1)):
         with pytest.raises(ValueError, match="dim_"):
             KFOPC(*bad)
-    shown = repr(KFOPC.random_walk(2, state_noise=1.0, measurement_noise=1.0, rated_power=2.0))
+    shown = repr(KFOPC.random_walk(2, state_noise=1.0, measurement_noise=1.0, rated_power=2.0, fs=8000))
     assert shown.startswith("RandomWalkKFOPC object\ndim_x = 2\n")
     assert "\nP = [[1. 0.]" in shown
     assert "\nrated_power = 2.0\nconstraint_factor = 1.0\n" in shown

@@ -66,7 +66,7 @@ def test_each_step_is_filterpys_of_the_measurements_scaled_by_the_least_factor()
 def test_one_rated_power_for_several_measurements_is_one_loudspeaker() -> None:
     """Squares are summed over measurements, and over references."""
     z, rows, x = signals()
-    one, listed, two = KFOPC(N, K, rated_power=0.5), KFOPC(N, K, rated_power=[0.5]), KFOPC(N, K, rated_power=[0.5])
+    one, listed, two = (KFOPC(N, K, rated_power=power, fs=FS) for power in (0.5, [0.5], [0.5]))
     for n in range(20):
         for kf, reference in ((one, x[n, 0]), (listed, x[n, 0]), (two, x[n])):
             kf.predict()
@@ -94,14 +94,14 @@ def test_a_loudspeaker_that_no_microphone_hears_is_left_out() -> None:
         loudspeaker_factors(oracle, z[n], unplugged[n], x[n][:, np.newaxis])
     np.testing.assert_array_equal(kf.x.reshape(J, -1)[1], 0.0)
     assert kf.constraint_factor == pytest.approx(least_factor(oracle), rel=1e-12)
-    kf = KFOPC(N, K, rated_power=RATED)  # none is heard: eq. 13 gives 0, as with one loudspeaker
+    kf = KFOPC(N, K, rated_power=RATED, fs=FS)  # none is heard: eq. 13 gives 0, as with one loudspeaker
     kf.update(z[0], H=np.zeros((K, N)), reference=x[0])
     assert kf.constraint_factor == 0.0
 
 
 def test_supplied_values_need_no_reference() -> None:
     z, rows, _ = signals()
-    kf = KFOPC(N, K, rated_power=RATED)
+    kf = KFOPC(N, K, rated_power=RATED, fs=FS)
     kf.disturbance_power, kf.secondary_path_gain = 4.0, [1.0, 0.125]
     kf.update(z[0], H=rows[0])
     assert kf.constraint_factor == 0.25  # the least of sqrt(0.5 / 4) and sqrt(2 * 0.125 / 4)
@@ -178,13 +178,13 @@ def test_what_does_not_fit_is_refused_with_nothing_changed(name: str) -> None:
 
 def test_settings_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="dim_x = 5 states cannot be the control filters of 2 loudspeakers"):
-        KFOPC(5, rated_power=[1.0, 2.0])
+        KFOPC(5, rated_power=[1.0, 2.0], fs=FS)
     for bad in ([], [1.0, "loud"]):
         with pytest.raises(TypeError):
-            KFOPC(4, rated_power=bad)
+            KFOPC(4, rated_power=bad, fs=FS)
     with pytest.raises(TypeError, match="constraint must be an OutputPowerConstraint or None"):
         KFOPC(4, constraint=[OutputPowerConstraint(1.0, fs=8000), 2.0])
-    fast = KFOPC.random_walk(4, state_noise=0.0, measurement_noise=1.0)
+    fast = KFOPC.random_walk(4, state_noise=0.0, measurement_noise=1.0, fs=FS)
     with pytest.raises(TypeError, match=r"this filter has one loudspeaker, .* not a sequence of 2"):
         fast.rated_power = [1.0, 2.0]
     fast.rated_power = 1.0

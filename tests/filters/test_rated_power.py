@@ -20,7 +20,7 @@ from oracles.powers import Constraint
 
 from kfopc_filterpy import KFOPC, OutputPowerConstraint
 
-TAPS, STATE_NOISE, NOISE = 5, 1e-4, 0.3
+TAPS, STATE_NOISE, NOISE, FS = 5, 1e-4, 0.3, 16000
 UPDATES = ["update", "update_steadystate", "update_correlated", "update_sequential"]
 UPDATES = [name for name in UPDATES if hasattr(KalmanFilter, name)]  # 1.4.5 has no update_sequential
 POWERS = ("constraint_factor", "disturbance_power", "secondary_path_gain")
@@ -29,9 +29,9 @@ both_kinds = pytest.mark.parametrize("kind", ["general", "random walk"])
 
 def make(kind: str, rated_power: float | None = None, **settings: Any) -> KFOPC:
     """A filter; `settings` are those of its constraint."""
-    own: dict[str, Any] = {"rated_power": rated_power}
+    own: dict[str, Any] = {"rated_power": rated_power, "fs": FS}
     if settings:
-        own = {"constraint": OutputPowerConstraint(rated_power or 1.0, **{"fs": 16000} | settings)}
+        own = {"constraint": OutputPowerConstraint(rated_power or 1.0, **{"fs": FS} | settings)}
     if kind == "random walk":
         kf: KFOPC = KFOPC.random_walk(TAPS, state_noise=STATE_NOISE, measurement_noise=NOISE, **own)
     else:
@@ -175,8 +175,9 @@ def test_a_rated_power_may_come_and_go_and_its_values_be_supplied(kind: str) -> 
 def test_a_constraint_that_is_none_or_one_too_many_is_refused(kind: str) -> None:
     noises = {"state_noise": 0.0, "measurement_noise": 1.0} if kind == "random walk" else {}
     made: Any = KFOPC.random_walk if kind == "random walk" else KFOPC
-    with pytest.raises(ValueError, match=r"give either rated_power= or constraint=.*, not both"):
-        made(3, rated_power=1.0, constraint=OutputPowerConstraint(1.0, fs=8000), **noises)
+    for both in ({"rated_power": 1.0}, {"fs": FS}):
+        with pytest.raises(ValueError, match="give either rated_power= and fs=, or constraint=, which has both"):
+            made(3, **both, constraint=OutputPowerConstraint(1.0, fs=8000), **noises)
     with pytest.raises(TypeError, match=r"constraint must be an OutputPowerConstraint or None, got 1\.0"):
         made(3, constraint=1.0, **noises)
     kf = make(kind)
@@ -185,12 +186,34 @@ def test_a_constraint_that_is_none_or_one_too_many_is_refused(kind: str) -> None
     assert kf.constraint is None
 
 
+@both_kinds
+def test_a_rated_power_needs_the_sample_rate_of_its_memory(kind: str) -> None:
+    noises = {"state_noise": 0.0, "measurement_noise": 1.0} if kind == "random walk" else {}
+    made: Any = KFOPC.random_walk if kind == "random walk" else KFOPC
+    with pytest.raises(ValueError, match=r"needs the sample rate.*give fs=.*kf\.constraint = OutputPowerConstraint"):
+        made(3, rated_power=1.0, **noises)
+    kf = made(3, **noises)
+    for power in (1.0, [1.0]):
+        with pytest.raises(ValueError, match="needs the sample rate"):
+            kf.rated_power = power
+    assert kf.rated_power is kf.constraint is None
+    kf.constraint = OutputPowerConstraint(1.0, fs=8000, memory_s=0.1)
+    assert kf.rated_power == 1.0
+    with pytest.raises(ValueError, match="fs must be greater than 0"):
+        made(3, fs=0.0, **noises)
+    kf = made(3, fs=4000, **noises)
+    assert kf.constraint is None
+    kf.rated_power = 2.0
+    assert (kf.constraint.fs, kf.constraint.memory_s, kf.rated_power) == (4000.0, 0.5, 2.0)
+    assert made(3, rated_power=2.0, fs=4000, **noises).constraint.fs == 4000.0
+
+
 # What a rated power is not for.
 
 
 def test_a_tracker_is_refused_before_anything_changes() -> None:
     """Its measurement would be scaled: the estimate of a target at 19.8 m, moving at 2 m/s, would be 1.7 m."""
-    kf = KFOPC(2, 1, rated_power=1.0)
+    kf = KFOPC(2, 1, rated_power=1.0, fs=10)
     kf.F, kf.H = [[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.0]]
     kf.secondary_path_gain, kf.M = 1.0, np.zeros((2, 1))
     x, P = kf.x, kf.P
@@ -200,7 +223,7 @@ def test_a_tracker_is_refused_before_anything_changes() -> None:
         ):
             step()
     with pytest.raises(ValueError, match="F must be the identity"):
-        KFOPC(2, 1, rated_power=1.0).predict(F=0.5)
+        KFOPC(2, 1, rated_power=1.0, fs=10).predict(F=0.5)
     assert kf.x is x
     assert kf.P is P
     kf.rated_power = None

@@ -13,7 +13,7 @@ from filterpy.kalman import KalmanFilter
 
 from kfopc_filterpy import KFOPC
 
-TAPS = 5
+TAPS, FS = 5, 16000
 NAN, INF = math.nan, math.inf
 ROW = np.linspace(1.0, 2.0, TAPS)
 UPDATES = ["update", "update_steadystate", "update_correlated", "update_sequential"]
@@ -26,9 +26,9 @@ Fault = tuple[Callable[[KFOPC], Any], str]
 def make(kind: str, rated_power: float | None = None) -> KFOPC:
     """A filter after some steps."""
     if kind == "random walk":
-        kf: KFOPC = KFOPC.random_walk(TAPS, state_noise=1e-4, measurement_noise=0.3, rated_power=rated_power)
+        kf: KFOPC = KFOPC.random_walk(TAPS, state_noise=1e-4, measurement_noise=0.3, rated_power=rated_power, fs=FS)
     else:
-        kf = KFOPC(TAPS, rated_power=rated_power)
+        kf = KFOPC(TAPS, rated_power=rated_power, fs=FS)
         kf.Q, kf.R = 1e-4 * np.eye(TAPS), np.array([[0.3]])
     kf.H, kf.M = ROW.reshape(1, -1).copy(), np.zeros((TAPS, 1))
     run(kf, 8)
@@ -385,7 +385,7 @@ def test_dimensions_are_whole_numbers(name: str, bad: Any) -> None:
 
 def test_a_rated_power_needs_all_measurements() -> None:
     """The power of the disturbance cannot be taken from some of the microphones."""
-    kf, twin = (KFOPC(4, 2, rated_power=1.0) for _ in range(2))
+    kf, twin = (KFOPC(4, 2, rated_power=1.0, fs=FS) for _ in range(2))
     H = np.ones((2, 4))
     with pytest.raises(ValueError, match="a rated power needs all measurements at once: mask them all"):
         kf.update(np.ma.array([1.0, 2.0], mask=[False, True]), H=H, reference=1.0)

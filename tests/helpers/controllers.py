@@ -240,7 +240,7 @@ ALL: dict[str, Any] = {f"{name} {variant}": lambda n=name, v=variant: made(n, v)
 ALL |= {f"{name} many": make for name, make in SEVERAL.items()} | IN_BLOCKS | AROUND
 
 FILTERS: dict[str, Any] = {
-    "KFOPC": lambda: _full(rated_power=0.3),
+    "KFOPC": lambda: _full(rated_power=0.3, fs=FS),
     "KFOPC, plain": _full,
     "KFOPC, loudspeakers": lambda: _full(constraint=constraints()),
     "random walk": lambda: KFOPC.random_walk(N_TAPS, **KALMAN),

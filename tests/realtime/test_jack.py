@@ -17,7 +17,7 @@ import pytest
 FS, BLOCK, SECONDS, STALLED_S, TRIES = 16000, 64, 12, 0.2, 3
 RUN = (
     *("-m", "kfopc_filterpy", "run", "--device", "plant", "--references", "0", "--errors", "1", "--outputs", "0"),
-    *("--rated-power", "0.02", "--amplitude-limit", "0.6", "--taps", "128", "--block", str(BLOCK)),
+    *("--rated-power", "0.02", "--amplitude-limit", "0.6", "--taps", "128", "--fs", str(FS), "--block", str(BLOCK)),
     *("--seconds", str(SECONDS)),
 )
 

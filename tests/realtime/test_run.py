@@ -473,13 +473,13 @@ def test_a_card_that_cannot_be_opened_is_named(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=stream, PortAudioError=OSError))
     with pytest.raises(ValueError, match=r"cannot be opened: Error querying device -1.* lists the devices"):
-        SoundDevice([0], [1]).start()
+        SoundDevice([0], [1], fs=FS).start()
 
 
 def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(uninstall: Callable[[str], None]) -> None:
     uninstall("sounddevice")
     with pytest.raises(ImportError, match=r"pip install -e .\.\[realtime\]."):
-        SoundDevice([0], [1]).start()
+        SoundDevice([0], [1], fs=FS).start()
 
 
 @pytest.mark.parametrize(
@@ -492,4 +492,4 @@ def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(uninsta
 )
 def test_channels_that_a_card_cannot_have_are_refused(channels: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        SoundDevice(*channels)
+        SoundDevice(*channels, fs=FS)
