@@ -48,7 +48,8 @@ def test_a_process_ends_with_0_if_the_amplifier_is_enough_and_writes_what_it_say
 
 @pytest.mark.slow
 def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(inside, capsys):
-    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    lines = text.splitlines()
     start = next(number for number, line in enumerate(lines) if "kfopc demo" in line and line.startswith(".venv"))
     _, write, folder = lines[start].split(" && ")[0].split()
     assert main([write, folder]) == 0
@@ -58,7 +59,9 @@ def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(inside, cap
     assert pasted[0] == "../.venv/bin/kfopc"
     assert main(pasted[1:]) == 0
     assert Path("out", "verdict.html").is_file()
-    watt = re.search(r"About (\S+) W into 8 ohm would do", capsys.readouterr().out)[1]
+    printed = capsys.readouterr().out
+    assert re.search(r"^```text\n(.*?)^```$", text, flags=re.M | re.S)[1] in printed
+    watt = re.search(r"About (\S+) W into 8 ohm would do", printed)[1]
     typed_back = " ".join(pasted[1:-2]).replace("--watt 50", f"--watt {watt}").replace("--primary P", "--disturbance d")
     assert main(typed_back.split()) == 0  # d.wav is what P.wav makes of noise.wav, and some noise of the microphone
     assert main(["demo", "."]) == 2
