@@ -5,6 +5,7 @@ What everyone uses is here; the rest is in the namespaces `filters`, `power`, `c
 namespace's, and is loaded when it is first used.
 """
 
+import sys
 from typing import Any
 
 import lazy_loader
@@ -21,6 +22,7 @@ def __getattr__(name: str) -> Any:
         if name.startswith("_") or name in __all__:
             raise
     from difflib import get_close_matches
+    from importlib.util import find_spec
     from pathlib import Path
 
     known = {there.lower(): there for there in __all__}
@@ -28,5 +30,8 @@ def __getattr__(name: str) -> Any:
         space = _load(stub.parent.name)
         known = {there.lower(): f"{space.__name__}.{there}" for there in space.__all__} | known
     meant = "".join(f"; did you mean {known[one]}?" for one in get_close_matches(name.lower(), known, n=1))
+    # `from kfopc_filterpy import ...` asks whether there is such a name, and would say nothing of an AttributeError
+    if sys._getframe(1).f_code.co_name == "_handle_fromlist" and find_spec(f"{__name__}.{name}") is None:
+        raise ImportError(f"cannot import name {name!r} from {__name__!r}{meant}", name=__name__)
     # with an object of its own, Python's traceback adds no guess among the top-level names
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}{meant}", name=name, obj=None)

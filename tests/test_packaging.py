@@ -104,6 +104,11 @@ def test_every_public_folder_is_an_attribute_and_a_misspelt_name_says_what_was_m
     }.items():
         with pytest.raises(AttributeError, match=rf"has no attribute '{wrong}'; did you mean {meant}\?"):
             getattr(package, wrong)
+        with pytest.raises(
+            ImportError, match=rf"cannot import name '{wrong}' from 'kfopc_filterpy'; did you mean {meant}\?"
+        ):
+            exec(f"from kfopc_filterpy import {wrong}")
+    exec("from kfopc_filterpy import checkpoint, filters, core")  # folders and files that are no public names
     with pytest.raises(AttributeError, match=r"has no attribute 'nothing_like_it'$"):
         _ = package.nothing_like_it
     assert not hasattr(package, "_repr_html_")
