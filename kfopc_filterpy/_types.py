@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     import control
     import numpy as np
 
-    from .plant import Plant
-
 # A float with one channel, with several an array with a number for each, (n,). As with numpy's own functions that return
 # a number or an array, it is Any: with a union, a type checker would have every caller check which of them came.
 NumberOrArray: TypeAlias = Any
@@ -26,8 +24,6 @@ System: TypeAlias = "control.TransferFunction | control.StateSpace"
 PathModel: TypeAlias = "ArrayLike | System"
 # One path, or several: taps (outputs, inputs, n_taps), a system with several channels, or rows of systems.
 PathModels: TypeAlias = "PathModel | Sequence[Sequence[System]]"
-# What a controller takes as the estimate of the secondary path: also that of a plant.
-Secondary: TypeAlias = "PathModels | Plant"
 
 
 class Counter(Protocol):

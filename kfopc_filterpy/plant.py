@@ -6,15 +6,14 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ._taps import feedback_paths, primary_paths, sampling_rate, secondary_paths
 from ._types import PathModels
 from ._validate import as_channels, as_count, as_nonnegative, as_positive
-from .paths.models import sampling_rate
-from .paths.path_matrix import feedback_paths, primary_paths, secondary_paths
 from .power.amplifiers import Amplifiers, amplifier_of_each
 from .signals.recordings import Recording
 
@@ -272,30 +271,6 @@ class Plant:
         plant._changes = ()
         return plant
 
-    def require_constant(self, what: str) -> None:
-        """Raise ValueError if the plant changes; `what` is the name of what needs one that does not."""
-        if self.changes:
-            raise ValueError(f"{what} needs a plant that does not change: give the one of a time, plant.at(time_s)")
-
-    def schedule(self, name: str) -> Schedule:
-        """Return the values of what is called `name` (secondary, primary, feedback or amplifier), and when each begins.
-
-        All have as many taps as the longest, filled with zeros; before a feedback path appears, its taps are zeros.
-        """
-        attribute = "amplifiers" if name == "amplifier" else name
-        own = [change for change in self._changes if name in change.changed]
-        values = [getattr(one, attribute) for one in (self, *(change.plant for change in own))]
-        if name in PATHS:
-            shape = next((value.shape[:-1] for value in values if value is not None), None)
-            values = [np.zeros((*shape, 1)) if value is None and shape else value for value in values]
-            longest = max((value.shape[-1] for value in values if value is not None), default=0)
-            values = [
-                value if value is None else np.pad(value, ((0, 0), (0, 0), (0, longest - value.shape[-1])))
-                for value in values
-            ]
-        fades = [0, *(0 if name == "amplifier" else change.fade for change in own)]
-        return Schedule([0, *(change.begin for change in own)], fades, values)
-
     def disturbance(self, reference: ArrayLike) -> np.ndarray:
         """Return the disturbance d = p*x that a reference causes at the error microphones.
 
@@ -314,57 +289,15 @@ class Plant:
         ValueError
             A plant without a primary path, or a reference with other channels or another sample rate.
         """
-        x = self.references(reference)
-        d = self._disturbances(x)
-        return d[0] if self.has_one_channel(x) else d
+        x = checked_references(self, reference)
+        d = _disturbances(self, x)
+        return d[0] if has_one_channel(self, x) else d
 
-    def has_one_channel(self, references: np.ndarray) -> bool:
-        """Return whether a run with these references, (I, n_samples), has one channel, so its signals no channel axis."""
-        return self.secondary.shape[:2] == (1, 1) and len(references) <= 1
-
-    def references(self, reference: ArrayLike) -> np.ndarray:
-        """Return `reference` as (I, n_samples), checked against the plant's channels and sample rate."""
-        require_rate(reference, self.fs, "reference")
-        x = np.atleast_2d(as_channels(reference, "reference"))
-        if self.n_references not in (None, len(x)):
-            raise ValueError(
-                f"reference must have the {self.n_references} channel(s) of the plant's paths, (I references, n_samples), "
-                f"got {len(x)}"
-            )
-        return x
-
-    def signals(self, reference: ArrayLike | None, disturbance: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return references (I, n_samples) and disturbances (K, n_samples).
-
-        These are `reference` and `disturbance`; if only the former is given, the disturbance is p*x.
-        """
-        if reference is None and disturbance is None:
-            raise ValueError("without a reference give disturbance=: a primary path would begin at the reference")
-        if disturbance is None and self.primary is None:
-            raise ValueError("the disturbance is unknown: make the plant with a primary path, or give disturbance=")
-        if disturbance is None:
-            x = self.references(reference)  # type: ignore[arg-type]
-            return x, self._disturbances(x)
-        require_rate(disturbance, self.fs, "disturbance")
-        d = np.atleast_2d(as_channels(disturbance, "disturbance"))
-        x = np.empty((0, d.shape[1])) if reference is None else self.references(reference)
-        if d.shape != (self.n_microphones, x.shape[1]):
-            raise ValueError(
-                f"disturbance must be (K microphones, n_samples) = {(self.n_microphones, x.shape[1])}, got {d.shape}"
-            )
-        return x, d
-
-    def _disturbances(self, x: np.ndarray) -> np.ndarray:
-        """Return p*x, (K, n_samples); sound on its way at a change arrives through the new path."""
-        if self.primary is None:
-            raise ValueError("the plant has no primary path: make it with one, Plant(secondary, primary)")
-        n_samples = x.shape[1]
-        d = np.zeros((self.n_microphones, n_samples))
-        for paths, part, share in self.schedule("primary").parts(n_samples):
-            first = max(part.start - paths.shape[2] + 1, 0)
-            heard = _convolved(x[:, first : part.stop], paths)
-            d[:, part] += share * heard[:, part.start - first : part.stop - first]
-        return d
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for name in PATHS:  # in a copy, numpy makes arrays that can be written to
+            if (taps := getattr(self, name)) is not None:
+                taps.flags.writeable = False
 
     def __repr__(self) -> str:
         parts = []
@@ -412,6 +345,14 @@ class Schedule:
             return (1.0 - share) * self.values[i - 1] + share * self.values[i], n + 1
         return self.values[i], self.begins[i + 1] if i + 1 < len(self.begins) else NEVER
 
+    def values_in(self, begin: int, n_samples: int) -> Iterator[tuple[Any, slice]]:
+        """Yield each value of the samples from `begin` on, and its samples, counted from `begin`."""
+        n = 0
+        while n < n_samples:
+            value, until = self.at(begin + n)
+            yield value, slice(n, min(until - begin, n_samples))
+            n = until - begin
+
     def parts(self, n_samples: int) -> Iterator[tuple[Any, slice, np.ndarray]]:
         """Yield each value, the samples in which it has a share of the whole, and its share in each of them."""
         for i, (value, begin) in enumerate(zip(self.values, self.begins, strict=True)):
@@ -427,14 +368,6 @@ class Schedule:
         return np.clip((n - self.begins[i] + (self.fades[i] == 0)) / max(self.fades[i], 1), 0.0, 1.0)
 
 
-def estimated_secondary(secondary: Any) -> tuple[np.ndarray, float | None]:
-    """Return secondary paths as taps (K, J, n_taps), and their sample rate in Hz if they tell it: those of a plant, too."""
-    if isinstance(secondary, Plant):
-        secondary.require_constant("an estimate of the secondary path")
-        return secondary.secondary.copy(), secondary.fs
-    return secondary_paths(secondary)
-
-
 def as_plant(plant: Any) -> Plant:
     """Return a plant, or raise TypeError if it is none."""
     if not isinstance(plant, Plant):
@@ -442,6 +375,99 @@ def as_plant(plant: Any) -> Plant:
             f"plant must be a Plant, got {type(plant).__name__}: Plant(secondary, primary, fs=...) makes one"
         )
     return plant
+
+
+def as_constant_plant(plant: Any, what: str) -> Plant:
+    """Return a plant that does not change, or raise TypeError or ValueError; `what` is the name of what needs it."""
+    if as_plant(plant).changes:
+        raise ValueError(f"{what} needs a plant that does not change: give the one of a time, plant.at(time_s)")
+    return plant
+
+
+def has_one_channel(plant: Plant, references: np.ndarray) -> bool:
+    """Return whether a run with these references, (I, n_samples), has one channel, so its signals no channel axis."""
+    return plant.secondary.shape[:2] == (1, 1) and len(references) <= 1
+
+
+def checked_references(plant: Plant, reference: ArrayLike) -> np.ndarray:
+    """Return `reference` as (I, n_samples), checked against the plant's channels and sample rate."""
+    require_rate(reference, plant.fs, "reference")
+    x = np.atleast_2d(as_channels(reference, "reference"))
+    if plant.n_references not in (None, len(x)):
+        raise ValueError(
+            f"reference must have the {plant.n_references} channel(s) of the plant's paths, (I references, n_samples), "
+            f"got {len(x)}"
+        )
+    return x
+
+
+def checked_signals(
+    plant: Plant, reference: ArrayLike | None, disturbance: ArrayLike | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return references (I, n_samples) and disturbances (K, n_samples).
+
+    These are `reference` and `disturbance`; if only the former is given, the disturbance is p*x.
+    """
+    if reference is None and disturbance is None:
+        raise ValueError("without a reference give disturbance=: a primary path would begin at the reference")
+    if disturbance is None and plant.primary is None:
+        raise ValueError("the disturbance is unknown: make the plant with a primary path, or give disturbance=")
+    if disturbance is None:
+        x = checked_references(plant, reference)  # type: ignore[arg-type]
+        return x, _disturbances(plant, x)
+    require_rate(disturbance, plant.fs, "disturbance")
+    d = np.atleast_2d(as_channels(disturbance, "disturbance"))
+    x = np.empty((0, d.shape[1])) if reference is None else checked_references(plant, reference)
+    if d.shape != (plant.n_microphones, x.shape[1]):
+        raise ValueError(
+            f"disturbance must be (K microphones, n_samples) = {(plant.n_microphones, x.shape[1])}, got {d.shape}"
+        )
+    return x, d
+
+
+def _disturbances(plant: Plant, x: np.ndarray) -> np.ndarray:
+    """Return p*x, (K, n_samples); sound on its way at a change arrives through the new path."""
+    if plant.primary is None:
+        raise ValueError("the plant has no primary path: make it with one, Plant(secondary, primary)")
+    n_samples = x.shape[1]
+    d = np.zeros((plant.n_microphones, n_samples))
+    for paths, part, share in schedule_of(plant, "primary").parts(n_samples):
+        first = max(part.start - paths.shape[2] + 1, 0)
+        heard = _convolved(x[:, first : part.stop], paths)
+        d[:, part] += share * heard[:, part.start - first : part.stop - first]
+    return d
+
+
+def schedule_of(plant: Plant, name: str) -> Schedule:
+    """Return the values of what is called `name` (secondary, primary, feedback or amplifier), and when each begins.
+
+    All have as many taps as the longest, filled with zeros; before a feedback path appears, its taps are zeros.
+    """
+    attribute = "amplifiers" if name == "amplifier" else name
+    own = [change for change in plant._changes if name in change.changed]
+    values = [getattr(one, attribute) for one in (plant, *(change.plant for change in own))]
+    if name in PATHS:
+        shape = next((value.shape[:-1] for value in values if value is not None), None)
+        values = [np.zeros((*shape, 1)) if value is None and shape else value for value in values]
+        longest = max((value.shape[-1] for value in values if value is not None), default=0)
+        values = [
+            value if value is None else np.pad(value, ((0, 0), (0, 0), (0, longest - value.shape[-1])))
+            for value in values
+        ]
+    fades = [0, *(0 if name == "amplifier" else change.fade for change in own)]
+    return Schedule([0, *(change.begin for change in own)], fades, values)
+
+
+# What a controller takes as the estimate of the secondary path: also that of a plant.
+Secondary: TypeAlias = "PathModels | Plant"
+
+
+def estimated_secondary(secondary: Any) -> tuple[np.ndarray, float | None]:
+    """Return secondary paths as taps (K, J, n_taps), and their sample rate in Hz if they tell it: those of a plant, too."""
+    if isinstance(secondary, Plant):
+        plant = as_constant_plant(secondary, "an estimate of the secondary path")
+        return plant.secondary.copy(), plant.fs
+    return secondary_paths(secondary)
 
 
 def _common_rate(rates: dict[str, float]) -> float:

@@ -82,6 +82,11 @@ def test_an_infinite_response_has_as_many_taps_as_are_asked_for():
     np.testing.assert_array_equal(changed.at(1.0).secondary[1], -plant.secondary[0])
 
 
+def test_paths_may_have_fewer_taps_than_channels():
+    assert Plant([[[1.0], [0.5]]], fs=FS).secondary.shape == (1, 2, 1)
+    assert Plant(np.ones((4, 4, 1)), np.ones((4, 1, 2)), fs=FS).n_references == 1
+
+
 def test_a_plant_keeps_copies_that_cannot_be_written():
     taps = SECONDARY.copy()
     plant = Plant(taps, fs=FS)
@@ -103,6 +108,7 @@ def test_copies_and_pickles_are_the_plant():
     for other in (copy.deepcopy(plant), pickle.loads(pickle.dumps(plant))):
         assert repr(other) == repr(plant)
         np.testing.assert_array_equal(other.at(0.1).secondary, plant.at(0.1).secondary)
+        assert not any(taps.flags.writeable for taps in (other.secondary, other.primary, other.at(0.1).secondary))
 
 
 # ---- The sample rate

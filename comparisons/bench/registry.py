@@ -70,6 +70,8 @@ class Algorithm:
         Whether the studies of several channels compare it; those of one channel compare all.
     in_core : bool, default True
         Whether it is in the compiled core, which can be exported.
+    what : str, default ""
+        What it is, in a few words.
     """
 
     make: Callable[..., Controller]
@@ -87,6 +89,7 @@ class Algorithm:
     may_refuse: bool = False
     several_channels: bool = False
     in_core: bool = True
+    what: str = ""
 
     @property
     def grid(self) -> list[Setting]:
@@ -219,33 +222,152 @@ _KNOWS: dict[str, Any] = {"knows_amplifier": True}
 _CHANNELS: dict[str, Any] = {"several_channels": True}
 
 
-def _made_by(name: str, settings: Settings, **about: Any) -> Algorithm:
+def _made_by(name: str, what: str, settings: Settings, **about: Any) -> Algorithm:
     """Return an entry of an algorithm of the package."""
-    return Algorithm(MAKERS[name], settings, in_core=name in CORE, **about)
+    return Algorithm(MAKERS[name], settings, in_core=name in CORE, what=what, **about)
 
 
 REGISTRY: dict[str, Algorithm] = {
-    "KF-ANC": _made_by("KF-ANC", _random_walk, of_paper=True, shares_gains=True, **_RANDOM_WALK, **_FREE, **_CHANNELS),
-    "KF-OPC": _made_by(
-        "KF-OPC", _constrained(_random_walk), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_CHANNELS
+    "KF-ANC": _made_by(
+        "KF-ANC",
+        "a Kalman filter that learns the control filter and knows no rated power",
+        _random_walk,
+        of_paper=True,
+        shares_gains=True,
+        **_RANDOM_WALK,
+        **_FREE,
+        **_CHANNELS,
     ),
-    "KF-PB": _made_by("KF-PB", _power_budget, **_BUDGET, **_CHANNELS),
-    "diagonal KF": _made_by("diagonal KF", _random_walk, **_DIAGONAL, **_FREE),
-    "diagonal KF-OPC": _made_by("diagonal KF", _constrained(_random_walk), **_DIAGONAL),
-    "FxRLS": _made_by("FxRLS", _forgetting, may_refuse=True, **_LEAST_FORGOTTEN, **_FREE, **_KNOWS),
-    "FxLMS": _made_by("FxLMS", _step, of_paper=True, **_STEP, **_FREE, **_CHANNELS),
-    "FxNLMS": _made_by("FxNLMS", _normalised, **_STEP, **_FREE, **_CHANNELS),
-    "leaky FxLMS": _made_by("leaky FxLMS", _leak, **_LEAK, **_CHANNELS),
-    "optimal leaky FxLMS": _made_by("optimal leaky FxLMS", _constrained(_step), **_STEP, **_KNOWS, **_CHANNELS),
-    "MOV-FxLMS fixed": _made_by("MOV-FxLMS", _penalty, **_PENALTY, **_KNOWS, **_CHANNELS),
-    "MOV-FxLMS by variance": _made_by("MOV-FxLMS", _penalty_by_variance, **_STEP, **_KNOWS),
-    "MOV-FxLMS": _made_by("MOV-FxLMS", _constrained(_step), of_paper=True, **_STEP, **_KNOWS, **_CHANNELS),
-    "MOV-MFxLMS": _made_by("MOV-MFxLMS", _constrained(_step), **_STEP, **_KNOWS, **_CHANNELS),
-    "two-gradient FxLMS": _made_by("two-gradient FxLMS", _two_gradients, **_PEAK, **_CHANNELS),
-    "re-scaling FxLMS": _made_by("re-scaling FxLMS", _peak, **_PEAK, **_CHANNELS),
-    "clipping FxLMS": _made_by("clipping FxLMS", _peak, **_PEAK, **_CHANNELS),
-    "frequency-domain FxLMS": _made_by("frequency-domain FxLMS", _in_blocks, **_BLOCKS, **_FREE),
-    "power-limited FxLMS": Algorithm(PowerLimitedFxLMS, _within_power, in_core=False, **_BLOCKS),
+    "KF-OPC": _made_by(
+        "KF-OPC",
+        "KF-ANC with the disturbance scaled by a constraint factor, which is meant to keep the rated power",
+        _constrained(_random_walk),
+        of_paper=True,
+        shares_gains=True,
+        **_RANDOM_WALK,
+        **_CHANNELS,
+    ),
+    "KF-PB": _made_by(
+        "KF-PB",
+        "a Kalman filter that learns the paths, keeps the rated power, and spends it where it reduces the noise most",
+        _power_budget,
+        **_BUDGET,
+        **_CHANNELS,
+    ),
+    "diagonal KF": _made_by(
+        "diagonal KF",
+        "KF-ANC that leaves out how the weights' errors depend on each other; it computes and learns less",
+        _random_walk,
+        **_DIAGONAL,
+        **_FREE,
+    ),
+    "diagonal KF-OPC": _made_by(
+        "diagonal KF", "the diagonal KF with KF-OPC's constraint factor", _constrained(_random_walk), **_DIAGONAL
+    ),
+    "FxRLS": _made_by(
+        "FxRLS",
+        "recursive least squares with exponential forgetting; it knows no rated power",
+        _forgetting,
+        may_refuse=True,
+        **_LEAST_FORGOTTEN,
+        **_FREE,
+        **_KNOWS,
+    ),
+    "FxLMS": _made_by(
+        "FxLMS",
+        "the usual gradient descent on the squared error; it knows no rated power",
+        _step,
+        of_paper=True,
+        **_STEP,
+        **_FREE,
+        **_CHANNELS,
+    ),
+    "FxNLMS": _made_by(
+        "FxNLMS",
+        "FxLMS with a step size relative to the power of the filtered reference",
+        _normalised,
+        **_STEP,
+        **_FREE,
+        **_CHANNELS,
+    ),
+    "leaky FxLMS": _made_by(
+        "leaky FxLMS",
+        "FxLMS whose weights decay all the time, by a leak that was tuned to the rated power",
+        _leak,
+        **_LEAK,
+        **_CHANNELS,
+    ),
+    "optimal leaky FxLMS": _made_by(
+        "optimal leaky FxLMS",
+        "leaky FxLMS that computes its leak from the rated power as it runs",
+        _constrained(_step),
+        **_STEP,
+        **_KNOWS,
+        **_CHANNELS,
+    ),
+    "MOV-FxLMS fixed": _made_by(
+        "MOV-FxLMS",
+        "MOV-FxLMS with a fixed penalty that was tuned to the rated power",
+        _penalty,
+        **_PENALTY,
+        **_KNOWS,
+        **_CHANNELS,
+    ),
+    "MOV-FxLMS by variance": _made_by(
+        "MOV-FxLMS",
+        "MOV-FxLMS with a fixed penalty, from the variance of the whole disturbance",
+        _penalty_by_variance,
+        **_STEP,
+        **_KNOWS,
+    ),
+    "MOV-FxLMS": _made_by(
+        "MOV-FxLMS",
+        "FxLMS with a penalty on the output power, computed from the rated power as it runs",
+        _constrained(_step),
+        of_paper=True,
+        **_STEP,
+        **_KNOWS,
+        **_CHANNELS,
+    ),
+    "MOV-MFxLMS": _made_by(
+        "MOV-MFxLMS",
+        "MOV-FxLMS without the delay of the secondary path in its loop",
+        _constrained(_step),
+        **_STEP,
+        **_KNOWS,
+        **_CHANNELS,
+    ),
+    "two-gradient FxLMS": _made_by(
+        "two-gradient FxLMS",
+        "FxLMS that descends on the output power instead while a sample is beyond an amplitude limit",
+        _two_gradients,
+        **_PEAK,
+        **_CHANNELS,
+    ),
+    "re-scaling FxLMS": _made_by(
+        "re-scaling FxLMS",
+        "FxLMS that scales its weights down when a sample is beyond an amplitude limit",
+        _peak,
+        **_PEAK,
+        **_CHANNELS,
+    ),
+    "clipping FxLMS": _made_by(
+        "clipping FxLMS", "FxLMS whose control signal is clipped at an amplitude limit", _peak, **_PEAK, **_CHANNELS
+    ),
+    "frequency-domain FxLMS": _made_by(
+        "frequency-domain FxLMS",
+        "FxLMS that adapts once per block, each frequency at its own rate; it knows no rated power",
+        _in_blocks,
+        **_BLOCKS,
+        **_FREE,
+    ),
+    "power-limited FxLMS": Algorithm(
+        PowerLimitedFxLMS,
+        _within_power,
+        in_core=False,
+        what="frequency-domain FxLMS with a price on the output power that follows the measured power",
+        **_BLOCKS,
+    ),
 }
 
 

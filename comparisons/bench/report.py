@@ -13,8 +13,8 @@ from kfopc_filterpy._writing import jsonable, prepare_folder, replacing_files, w
 from kfopc_filterpy.verdict.items import write_files
 from kfopc_filterpy.verdict.page import images, players, rendered
 
-from .descriptions import DESCRIPTIONS
 from .merit import MERITS
+from .registry import REGISTRY
 from .study_report import Claim, StudyReport, claims_sentence, require_different
 
 SCREEN_ROWS = 30  # of a table that fits a screen
@@ -82,7 +82,7 @@ def _page(studies: Sequence[StudyReport], folder: Path) -> str:
         for study in studies
     ]
     names = dict.fromkeys(name for study in studies for name in study.algorithms)
-    described = {name: DESCRIPTIONS[name] for name in names if name in DESCRIPTIONS}
+    described = {name: REGISTRY[name].what for name in names if name in REGISTRY}
     return rendered(TEMPLATE, parts=parts, claims=claims_sentence(studies), described=described, merits=MERITS)
 
 

@@ -23,6 +23,7 @@ from kfopc_filterpy.bounds import (
 )
 from kfopc_filterpy.bounds.channel_bound import channel_record
 from kfopc_filterpy.controllers import Controller
+from kfopc_filterpy.plant import checked_references, has_one_channel
 from kfopc_filterpy.power.amplifiers import Amplifier
 from kfopc_filterpy.verdict.candidates import filtered_power
 from kfopc_filterpy.verdict.runs import one_blas_thread
@@ -363,12 +364,12 @@ def _as_rating(rated_power: Any, plant: Plant | None) -> Any:
 
 def _as_reference(x: Any, switch_on_s: float, plant: Plant) -> np.ndarray:
     """Return a noise as (n_samples,), or as (I, n_samples) with several channels."""
-    x = plant.references(x)
+    x = checked_references(plant, x)
     if x.shape[1] <= int(switch_on_s * plant.fs):
         raise ValueError(
             f"references must be longer than switch_on_s = {switch_on_s:g} s, got {x.shape[1] / plant.fs:g} s"
         )
-    return x[0] if plant.has_one_channel(x) else x
+    return x[0] if has_one_channel(plant, x) else x
 
 
 def _power(x: np.ndarray) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from .._types import NumberOrArray, PerLoudspeaker
 from .._validate import as_nonnegative, as_positive, as_sample_count, per_loudspeaker
 from ..metrics import overshoot
-from ..plant import Plant, as_plant
+from ..plant import Plant, as_constant_plant, checked_signals, has_one_channel
 from . import wiener
 from .channel_bound import ChannelStretch, channel_record
 
@@ -328,8 +328,8 @@ def power_constrained_wiener(
     {'whole': 5.6, 'per_second': 4.4, 'unconstrained': 16.0, 'scaled': 3.3, 'scaled_per_second': 2.5}
     """
     ridge = as_nonnegative(ridge, "ridge")
-    as_plant(plant).require_constant("power_constrained_wiener")
-    x, d = plant.signals(reference, disturbance)
+    as_constant_plant(plant, "power_constrained_wiener")
+    x, d = checked_signals(plant, reference, disturbance)
     fs, record = plant.fs, record_of_any(x, d, plant, n_taps)
     if isinstance(record, ChannelStretch):
         rated_power = per_loudspeaker(rated_power, plant.n_loudspeakers, "rated_power")
@@ -429,7 +429,7 @@ def power_constrained_solution(
 
 def record_of_any(x: np.ndarray, d: np.ndarray, plant: Plant, n_taps: int) -> wiener.Record:
     """Return the record of checked signals, (I, n) and (K, n): one channel has more exact solutions than several."""
-    if plant.has_one_channel(x):
+    if has_one_channel(plant, x):
         return wiener.record_of(x[0], d[0], plant.secondary[0, 0], n_taps)
     return channel_record(x, d, plant.secondary, n_taps)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_choice, as_finite_array, as_positive, per_loudspeaker
-from ..plant import Plant, as_plant
+from ..plant import Plant, as_constant_plant, checked_signals, has_one_channel
 from .channel_bound import ChannelCorrelations, channel_record
 from .wiener import reduction_db
 
@@ -225,8 +225,8 @@ def budgeted_rated_power(
     """
     as_choice(beyond, "beyond", ("raise", "inf"))
     wanted = _wanted(noise_reduction_db)
-    as_plant(plant).require_constant("budgeted_rated_power")
-    x, d = plant.signals(reference, disturbance)
+    as_constant_plant(plant, "budgeted_rated_power")
+    x, d = checked_signals(plant, reference, disturbance)
     record = channel_record(x, d, plant.secondary, n_taps).with_sound()
     shares = per_loudspeaker(1.0 if proportions is None else proportions, record.shape[0], "proportions")
     search = _ScaleSearch(record.correlations(), shares, float(np.sum(np.mean(record.d**2, axis=-1))))
@@ -237,7 +237,7 @@ def budgeted_rated_power(
         )
     found = np.array([search.powers(one) for one in wanted.ravel()])  # (n, 3, J)
     each = np.moveaxis(found, 1, 0).reshape(3, *wanted.shape, -1)
-    return BudgetedRatedPower(wanted, *(each[..., 0] if plant.has_one_channel(x) else each))
+    return BudgetedRatedPower(wanted, *(each[..., 0] if has_one_channel(plant, x) else each))
 
 
 class _ScaleSearch:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from .._validate import as_count, as_positive
 from ..paths.least_squares import RANK_TOLERANCE
-from ..plant import Plant, as_plant
+from ..plant import Plant, as_constant_plant, checked_signals, has_one_channel
 from .power_constrained import record_of_any
 from .wiener import ERROR_THAT_MATTERS, Record, mean_square, reduction_db
 
@@ -166,10 +166,10 @@ def suggest_settings(
     >>> kf_opc(suggested.n_taps, plant, rated_power=1.0, **suggested.noises).name
     'KF-OPC'
     """
-    as_plant(plant).require_constant("suggest_settings")
+    as_constant_plant(plant, "suggest_settings")
     fs = plant.fs
     memory = as_positive(memory_s, "memory_s", unit="s") * fs
-    fit = _Fits(*plant.signals(reference, disturbance), plant, n_taps, max_taps)
+    fit = _Fits(*checked_signals(plant, reference, disturbance), plant, n_taps, max_taps)
     longest, d_power, filtered_power = fit.stretch.n_taps, mean_square(fit.stretch.d), fit.filtered_power
     errors, quietest = fit.error_powers(0.0), ERROR_THAT_MATTERS * d_power
     if n_taps is None:
@@ -207,7 +207,7 @@ class _Fits:
         self.n_microphones, self.per_tap = K, J * len(x)
         longest = _longest(x.shape[-1], n_path, n_taps, max_taps, self.crowding)
         self.stretch: Record = record_of_any(x, d, plant, longest).full(n_path)
-        one = plant.has_one_channel(x)
+        one = has_one_channel(plant, x)
         self.variance_rule = "E[d^2] / (L E[x'^2])" if one else "K E[d^2] / (J I L E[x'^2])"
         self.filtered_power = self.stretch.filtered_power / self.per_tap
         powers = {"the filtered reference": self.filtered_power, "disturbance": mean_square(self.stretch.d)}

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from .._validate import as_channels, as_count, as_nonnegative, as_positive, as_signal
 from ..paths.least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve
-from ..plant import Plant, as_plant
+from ..plant import Plant, as_constant_plant, checked_signals, has_one_channel
 
 # A control power that exceeds the rated one by no more than this share of it counts as within it.
 BUDGET_TOLERANCE = 1e-12
@@ -367,9 +367,9 @@ def one_channel(
     reference: ArrayLike, plant: Plant, disturbance: ArrayLike | None, what: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return reference, disturbance and secondary path of one channel, in the name of what needs them."""
-    as_plant(plant).require_constant(what)
-    x, d = plant.signals(reference, disturbance)
-    if not plant.has_one_channel(x):
+    as_constant_plant(plant, what)
+    x, d = checked_signals(plant, reference, disturbance)
+    if not has_one_channel(plant, x):
         raise ValueError(
             f"{what} takes one channel, got {len(x)} reference(s) and secondary paths {plant.secondary.shape[:2]}: "
             "power_constrained_wiener takes several"

@@ -104,7 +104,7 @@ class Files:
 
     def matrix(self, paths: Sequence[str], option: str, n_microphones: int | None = None) -> np.ndarray:
         """Return the taps of paths, (microphones, sources, taps); see the examples of `verdict` for their order."""
-        from ..paths.models import stacked
+        from .._taps import stacked
 
         each = [self._read(path, is_path=True).samples for path in paths]
         if any(one.ndim == 3 for one in each):

@@ -218,7 +218,7 @@ def _powers(report: RunStatus | RunReport, of: str = "") -> str:
 
 def _facts(report: RunReport) -> str:
     """Return a report as JSON, without the arrays of the path and the controller."""
-    facts = {name: value for name, value in vars(report).items() if name not in ("secondary_path", "controller")}
+    facts = {name: value for name, value in vars(report).items() if name not in ("secondary", "controller")}
     return json.dumps(jsonable(facts | {"health": [vars(event) for event in report.health.events]}), indent=2)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from .._types import PerLoudspeaker, Secondary
+from .._types import PerLoudspeaker
+from ..plant import Secondary
 from ..power.limiter import Limiters
 from .core_controller import CoreController
 from .making import controller_maker

@@ -9,12 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PerLoudspeaker, Secondary
+from .._types import NumberOrArray, PerLoudspeaker
 from .._validate import as_count, as_nonnegative, as_positive, per_channel, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..core.block import REASONS, Algorithm, Block, InUse, Shape
 from ..core.run_loop import REFUSED_REFERENCE, Steps, process
 from ..paths.uncertainty import Uncertainty, as_uncertainty, guard_filter
+from ..plant import Secondary
 from ..power.amplifiers import Amplifiers, amplifier_models
 from ..power.constraint import NUMBERS, Constraints, OutputPowerConstraint
 from ..power.limiter import Limiters, OutputLimiter

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._types import PerLoudspeaker, Secondary
+from .._types import PerLoudspeaker
+from ..plant import Secondary
 from ..power.amplifiers import Amplifiers
 from ..power.constraint import Constraints
 from ..power.limiter import Limiters

@@ -6,8 +6,8 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike
 
-from .._types import Secondary
 from ..filters.kfopc import KFOPC
+from ..plant import Secondary
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, Secondary
+from .._taps import feedback_paths
+from .._types import NumberOrArray
 from .._validate import as_channels
-from ..paths.path_matrix import feedback_paths
-from ..plant import Plant
+from ..plant import Plant, Secondary, as_constant_plant
 from ..power.amplifiers import Amplifiers
 from .base import Controller, WrappedController, differing_counts, listening
 from .channel_samples import PlayedSound, channel_sample
@@ -69,7 +69,7 @@ class FeedbackNeutralizer(WrappedController):
         super().__init__(controller, "with feedback neutralisation")
         path_fs: float | None
         if isinstance(feedback, Plant):
-            feedback.require_constant("FeedbackNeutralizer")
+            as_constant_plant(feedback, "FeedbackNeutralizer")
             if feedback.feedback is None:
                 raise ValueError("feedback must be a plant with a feedback path, got one without")
             paths, path_fs = feedback.feedback, feedback.fs

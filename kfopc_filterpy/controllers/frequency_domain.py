@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import irfft, next_fast_len, rfft
 
-from .._types import NumberOrArray, Secondary
+from .._types import NumberOrArray
 from .._validate import as_choice, as_count, as_positive
 from ..checkpoint import Checkpointed
 from ..core.block import LOUDEST, LOUDEST_LEARNT
+from ..plant import Secondary
 from .base import as_forgetting, calls_of, require_rates
 from .channel_samples import require_moderate
 from .channels import Channels

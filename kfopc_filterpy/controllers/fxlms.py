@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .._types import Secondary
+from ..plant import Secondary
 from ..power.limiter import Limiters
 from .core_controller import CoreController
 from .making import controller_maker

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .._types import Secondary
 from .._validate import as_positive
+from ..plant import Secondary
 from ..power.limiter import Limiters
 from .core_controller import CoreController
 from .making import controller_maker

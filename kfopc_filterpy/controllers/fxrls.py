@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .._types import Secondary
 from .._validate import as_positive
+from ..plant import Secondary
 from ..power.amplifiers import Amplifier
 from ..power.limiter import OutputLimiter
 from .base import as_forgetting

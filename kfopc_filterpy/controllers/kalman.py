@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from .._types import NumberOrArray, PerLoudspeaker, PerMicrophone, Secondary
+from .._types import NumberOrArray, PerLoudspeaker, PerMicrophone
 from ..core.triangle import OWED, full_covariance
+from ..plant import Secondary
 from ..power.amplifiers import Amplifiers
 from ..power.constraint import Constraints
 from ..power.limiter import Limiters

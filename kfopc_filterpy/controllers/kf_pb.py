@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from .._types import NumberOrArray, PerLoudspeaker, Secondary
+from .._types import NumberOrArray, PerLoudspeaker
 from .._validate import as_positive
 from ..paths.uncertainty import Uncertainty, as_uncertainty, rms_relative_error
-from ..plant import estimated_secondary
+from ..plant import Secondary, estimated_secondary
 from ..power.amplifiers import Amplifiers
 from ..power.limiter import Limiters
 from .base import Looped, as_run_rate

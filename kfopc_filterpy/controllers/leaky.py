@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._types import PerLoudspeaker, Secondary
+from .._types import PerLoudspeaker
 from .._validate import as_nonnegative
+from ..plant import Secondary
 from ..power.amplifiers import Amplifiers
 from ..power.constraint import Constraints
 from ..power.limiter import Limiters

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from .._types import PerLoudspeaker, Secondary
+from .._types import PerLoudspeaker
 from .._validate import as_choice, as_nonnegative, as_positive
+from ..plant import Secondary
 from ..power.amplifiers import Amplifiers
 from ..power.constraint import Constraints
 from ..power.limiter import Limiters

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PerMicrophone, Secondary
+from .._types import NumberOrArray, PerMicrophone
 from .._validate import as_channels, as_count, as_real_array, per_channel, require_finite
 from ..core.block import LOUDEST
 from ..paths.observation import ObservationFilters
-from ..plant import estimated_secondary
+from ..plant import Secondary, estimated_secondary
 from ..power.amplifiers import Amplifiers
 from .base import Controller, WrappedController, differing_counts, listening
 from .channel_samples import ChannelFilters, PlayedSound, require_moderate

@@ -19,7 +19,7 @@ from ..controllers.processing import takes_none
 from ..core.block import LOUDEST, LOUDEST_LEARNT
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Record, Signals
 from ..core.run_loop import Plant as CompiledPlant
-from ..plant import Plant, as_plant
+from ..plant import Plant, as_plant, checked_signals, has_one_channel, schedule_of
 from ..power.amplifiers import amplified_sample, amplifier_models, compiled_model
 from .inputs import RECORDED, RESULTS, STRETCH, SensorNoise, divergence_limits, naming_sample, switch_on_sample
 from .result import SimulationResult
@@ -203,8 +203,8 @@ class _Run:
                 "the plant's primary path gives the disturbance, and so does disturbance=: give one of them"
             )
         self.without_reference = takes_none(controller, self.given)
-        self.x, self.d = plant.signals(self.given, self.disturbance)
-        self.several = not plant.has_one_channel(self.x)
+        self.x, self.d = checked_signals(plant, self.given, self.disturbance)
+        self.several = not has_one_channel(plant, self.x)
         K, J, _ = plant.secondary.shape
         counts = {"n_references": len(self.x), "n_loudspeakers": J, "n_microphones": K}
         for name, own in differing_counts(controller, **counts):
@@ -215,7 +215,7 @@ class _Run:
         self.fs = plant.fs
         self.on = switch_on_sample(self.switch_on_s, self.fs, self.x.shape[1])
         self.secondary, self.feedback, self.amplifiers = (
-            plant.schedule(name) for name in ("secondary", "feedback", "amplifier")
+            schedule_of(plant, name) for name in ("secondary", "feedback", "amplifier")
         )
         if (last := max(s.begins[-1] for s in (self.secondary, self.feedback, self.amplifiers))) >= self.x.shape[1]:
             raise ValueError(

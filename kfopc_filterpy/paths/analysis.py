@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .._taps import finite_taps, path_taps, sampling_rate
 from .._types import PathModel
 from .._validate import as_band, as_number, as_positive, as_signal
-from ..plant import Plant, as_plant
+from ..plant import Plant, as_constant_plant, has_one_channel
 from .file_checks import require_sound
-from .models import finite_taps, path_taps, sampling_rate
 
 STABILITY_BOUND_DEG = 90.0
 """Phase error of the estimate beyond which filtered-reference adaptation diverges, in degrees."""
@@ -461,7 +461,7 @@ def causality_margin(
     share = as_positive(onset_share, "onset_share")
     if share >= 1:
         raise ValueError(f"onset_share must be below 1, got {share:g}")
-    as_plant(plant).require_constant("causality_margin")
+    as_constant_plant(plant, "causality_margin")
     if plant.primary is None:
         raise ValueError("plant must have a primary path: make it with Plant(secondary, primary)")
     p, s, fs = plant.primary, plant.secondary, plant.fs
@@ -475,7 +475,7 @@ def causality_margin(
     onsets = [of_each(paths, lambda h: energy_onset(h, share) / fs) for paths in (p, s)]
     delays = [of_each(paths, lambda h: _mean_group_delay(h, low, high, fs)) for paths in (p, s)]
     found: list[Any] = [onsets[0].min(axis=1), onsets[1], delays[0].min(axis=1), delays[1]]
-    onset_p, onset_s, delay_p, delay_s = (one.item() for one in found) if plant.has_one_channel(p[0]) else found
+    onset_p, onset_s, delay_p, delay_s = (one.item() for one in found) if has_one_channel(plant, p[0]) else found
     return CausalityMargin(onset_p, onset_s, delay_p, delay_s, fs)
 
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.polynomial.polynomial import polysub
 from numpy.typing import ArrayLike
 
+from .._taps import path_matrix
 from .._types import PathModels
 from .._validate import as_real_array
-from ..plant import Plant, as_plant
-from .path_matrix import path_matrix
+from ..plant import Plant, as_constant_plant
 
 if TYPE_CHECKING:
     import control
@@ -165,7 +165,7 @@ def feedback_margin(control_filter: PathModels, plant: Plant, estimate: PathMode
     >>> feedback_margin([2.0], plant)
     <FeedbackMargin: unstable>
     """
-    as_plant(plant).require_constant("feedback_margin")
+    as_constant_plant(plant, "feedback_margin")
     if plant.feedback is None:
         raise ValueError("plant must have a feedback path: make it with Plant(..., feedback=...)")
     f, fs = plant.feedback, plant.fs
@@ -239,7 +239,7 @@ def internal_model_margin(
     >>> internal_model_margin(filters, Plant(path, fs=8000)).path_error.__round__(9)
     1.0
     """
-    as_plant(plant).require_constant("internal_model_margin")
+    as_constant_plant(plant, "internal_model_margin")
     s, fs = plant.secondary, plant.fs
     w, _ = path_matrix(control_filter, fs=fs, name="control_filter")
     _require_fit(w, s, min(w.shape[1], len(s)))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polysub
 from numpy.typing import ArrayLike
 
+from .._taps import path_taps
 from .._types import PathModel, Seed
 from .._validate import (
     as_channels,
@@ -23,11 +24,11 @@ from .._validate import (
     require_channels_lead,
     require_finite,
 )
-from ..plant import Plant, as_plant
+from ..plant import Plant, as_constant_plant
 from ..power.amplifiers import amplified_signal
 from .analysis import responses_of_both
 from .least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve, ridge_solve
-from .models import fir_path, path_taps
+from .models import fir_path
 from .uncertainty import relative_to
 
 if TYPE_CHECKING:
@@ -384,7 +385,7 @@ def identify_secondary_path(
     >>> result.taps.shape, bool(result.misalignment_db.max() < -30)
     ((2, 2, 3), True)
     """
-    as_plant(plant).require_constant("identify_secondary_path")
+    as_constant_plant(plant, "identify_secondary_path")
     true, fs = plant.secondary, plant.fs
     several = true.shape[:2] != (1, 1)
     for k, j in np.argwhere(~np.any(true, axis=2)):

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._taps import sampled_path_matrix
 from .._types import PathModels
 from .._validate import as_count
-from .path_matrix import sampled_path_matrix
 
 if TYPE_CHECKING:
     import control

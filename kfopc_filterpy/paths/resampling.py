@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._taps import is_system, path_taps, sampling_rate
 from .._types import PathModel
 from .._validate import as_positive, as_rate_ratio
-from .models import fir_path, is_system, path_taps, sampling_rate
+from .models import fir_path
 
 if TYPE_CHECKING:
     import control

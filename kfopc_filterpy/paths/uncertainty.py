@@ -30,9 +30,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import minimum_phase, windows
 
-from .._types import Secondary
 from .._validate import as_nonnegative, as_real_array, require_finite
-from ..plant import estimated_secondary
+from ..plant import Secondary, estimated_secondary
 
 N_FREQUENCIES = 257  # from 0 to fs/2
 OMEGA = np.linspace(0.0, np.pi, N_FREQUENCIES)

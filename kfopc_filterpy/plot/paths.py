@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .._taps import finite_taps, path_taps, sampling_rate
 from .._types import PathModel
 from .._validate import as_positive, as_signal
 from ..bounds.rated_power import required_rated_power
 from ..bounds.wiener import WienerSolution
 from ..paths import analysis
 from ..paths.identification import IdentificationResult
-from ..paths.models import finite_taps, path_taps, sampling_rate
 from . import style
 
 if TYPE_CHECKING:

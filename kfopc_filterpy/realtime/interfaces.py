@@ -12,7 +12,7 @@ from .._types import Seed
 from .._validate import as_choice, as_count
 from ..controllers.channel_samples import through
 from ..loop.inputs import SensorNoise
-from ..plant import Plant, Schedule, as_plant
+from ..plant import Plant, Schedule, as_plant, checked_signals, schedule_of
 from ..power.amplifiers import amplified_signal
 
 
@@ -136,7 +136,7 @@ class SimulatedInterface:
             raise ValueError(f"latency must be at least a block, {self.block} samples, got {self.latency}")
         self.clock = as_choice(clock, "clock", ("free", "real"))
         self._sensor_noise = SensorNoise(plant.sensor_noise_std, rng)
-        self._x, self.disturbance = plant.signals(reference, disturbance)
+        self._x, self.disturbance = checked_signals(plant, reference, disturbance)
         self.n_references = len(self._x)
         self.n_microphones, self.n_loudspeakers = plant.n_microphones, plant.n_loudspeakers
         begin = plant.at(0.0)
@@ -148,9 +148,9 @@ class SimulatedInterface:
             fs=self.fs,
             sensor_noise_std=begin.sensor_noise_std,
         )
-        self._amplifiers = plant.schedule("amplifier")
-        self._secondary = _Paths(plant.schedule("secondary"))
-        feedback = plant.schedule("feedback")
+        self._amplifiers = schedule_of(plant, "amplifier")
+        self._secondary = _Paths(schedule_of(plant, "secondary"))
+        feedback = schedule_of(plant, "feedback")
         self._feedback = None if feedback.values[0] is None else _Paths(feedback)
         self._queue = np.zeros((self.n_loudspeakers, self.latency))  # written, not yet played
         self._done, self._began = 0, 0.0
@@ -183,14 +183,21 @@ class SimulatedInterface:
         now = slice(self._done, self._done + self.block)
         if now.stop > self.n_samples:
             return None
-        y = self._queue[:, : self.block]
-        y = np.array([amplified_signal(*each) for each in zip(self._amplifiers.at(self._done)[0], y, strict=True)])
+        y = self._amplified(self._queue[:, : self.block])
         e = self.disturbance[:, now] - self._secondary(y)
         e += self._sensor_noise.take(*e.shape)
         x = self._x[:, now] + (0.0 if self._feedback is None else self._feedback(y))
         self._queue = np.concatenate((self._queue[:, self.block :], np.zeros((len(y), self.block))), axis=1)
         self._done = now.stop
         return x, e
+
+    def _amplified(self, y: np.ndarray) -> np.ndarray:
+        """Return the block `y`, (J, n), after the amplifiers, which are switched at the sample, as in `simulate`."""
+        played = [
+            np.array([amplified_signal(*each) for each in zip(amplifiers, y[:, part], strict=True)])
+            for amplifiers, part in self._amplifiers.values_in(self._done, y.shape[1])
+        ]
+        return np.concatenate(played, axis=1)
 
     def write(self, control_signals: np.ndarray) -> None:
         """Play `control_signals`, (J, n_samples), those of the block that was read last, `latency` samples after it."""
@@ -212,12 +219,10 @@ class _Paths:
 
     def __call__(self, signals: np.ndarray) -> np.ndarray:
         """Return the outputs, (outputs, n), of the next block, (inputs, n)."""
-        heard = np.concatenate((self._line, signals), axis=1)
-        parts, begin, n = [], 0, signals.shape[1]
-        while begin < n:
-            taps, until = self._schedule.at(self._done + begin)
-            end = min(until - self._done, n)
-            parts.append(through(taps, heard[:, begin : end + self._line.shape[1]]))
-            begin = end
+        heard, n = np.concatenate((self._line, signals), axis=1), signals.shape[1]
+        parts = [
+            through(taps, heard[:, part.start : part.stop + self._line.shape[1]])
+            for taps, part in self._schedule.values_in(self._done, n)
+        ]
         self._line, self._done = heard[:, n:], self._done + n
         return np.concatenate(parts, axis=1)

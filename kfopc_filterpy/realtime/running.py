@@ -103,7 +103,7 @@ class RunReport:
     round_trip_samples : int or None
         Samples from a control signal to its arrival at the nearest error microphone, buffers included; None if the
         path was not identified.
-    secondary_path : PathEstimate or None
+    secondary : PathEstimate or None
         Identified secondary path.
     possible_db : float
         Noise reduction that the best filter of `n_taps` taps reaches in the silence before the control; NaN if that was
@@ -126,7 +126,7 @@ class RunReport:
     powers: np.ndarray
     rated_power: np.ndarray | None
     round_trip_samples: int | None
-    secondary_path: PathEstimate | None
+    secondary: PathEstimate | None
     possible_db: float
     overruns: int
     blocks: int
@@ -619,7 +619,7 @@ class _Watch:
             seconds=self._samples / self._supervisor.fs,
             stopped_by=stopped_by,
             round_trip_samples=None if identified is None else identified.round_trip_samples,
-            secondary_path=None if identified is None else identified.path,
+            secondary=None if identified is None else identified.path,
             possible_db=possible_db,
             blocks=self._session.blocks,
             load=self._session.load,

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.signal import welch
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power, suggest_settings
+from kfopc_filterpy._taps import sampling_rate, tells_rate
 from kfopc_filterpy._validate import (
     as_channels,
     as_choice,
@@ -40,9 +41,8 @@ from kfopc_filterpy.paths import (
 )
 from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.file_checks import require_different, require_heard, require_sound
-from kfopc_filterpy.paths.models import sampling_rate, tells_rate
 from kfopc_filterpy.paths.uncertainty import Uncertainty, as_uncertainty
-from kfopc_filterpy.plant import Plant, as_plant
+from kfopc_filterpy.plant import Plant, as_constant_plant, checked_signals
 from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_remarks
 
 from .._types import ProgressBar
@@ -195,7 +195,7 @@ def assess(
     >>> print(verdict.enough, verdict.limited_by)
     False amplifier
     """
-    as_plant(plant).require_constant("assess")
+    as_constant_plant(plant, "assess")
     x, d, s = recorded_signals(noise, plant, disturbance, feedback)
     fs, p = plant.fs, plant.primary
     several = s.ndim == 3
@@ -359,7 +359,7 @@ def recorded_signals(
                 f"noise must have the {plant.n_references} channel(s) of the plant's primary path, got {len(x)}; leave out "
                 "the channels that do not fit"
             )
-        _, d = plant.signals(x, None)
+        _, d = checked_signals(plant, x, None)
     if not np.any(d):
         raise ValueError("disturbance must not be silent: every value is 0")
     if feedback:
@@ -449,7 +449,7 @@ def _on_differing_path(noise: ArrayLike, plant: Plant, disturbance: ArrayLike) -
         raise ValueError(
             f"noise must have the {plant.n_references} channel(s) of the plant's primary path, got {len(x)}"
         )
-    left = d - plant.signals(x, None)[1]
+    left = d - checked_signals(plant, x, None)[1]
     left_db = -reduction_db(mean_square(left), mean_square(d))
     if left_db < DIFFERING_DB:
         return []

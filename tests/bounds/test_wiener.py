@@ -8,11 +8,12 @@ import scipy.signal
 from helpers.channels import delayed
 
 from kfopc_filterpy import Plant
+from kfopc_filterpy._taps import path_taps
 from kfopc_filterpy.bounds import coherence_bound, wiener_solution
 from kfopc_filterpy.bounds.power_constrained import power_constrained_solution, power_constrained_wiener
 from kfopc_filterpy.paths import duct_plant
 from kfopc_filterpy.paths.least_squares import correlation_matrix
-from kfopc_filterpy.paths.models import bandpass_path, path_taps
+from kfopc_filterpy.paths.models import bandpass_path
 from kfopc_filterpy.signals import band_limited_noise
 
 FS = 16000.0

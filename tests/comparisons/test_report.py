@@ -14,7 +14,6 @@ import soundfile
 from helpers.reports import FS, figure, study
 
 from comparisons.bench import report
-from comparisons.bench.descriptions import DESCRIPTIONS
 from comparisons.bench.registry import REGISTRY
 from comparisons.bench.report import results_table, write_report
 from comparisons.bench.study_report import Claim, FigureItem, Sound, Table
@@ -259,7 +258,7 @@ def test_a_report_that_fails_leaves_the_old_one(tmp_path):
 
 
 def test_every_algorithm_has_a_description():
-    assert set(DESCRIPTIONS) == set(REGISTRY)
+    assert all(own.what for own in REGISTRY.values())
 
 
 # ---- Claims

@@ -124,14 +124,14 @@ def test_several_channels_change_too() -> None:
 
 @pytest.mark.parametrize("fade", [0, 20])
 def test_a_simulated_interface_is_that_plant_and_changes_too(fade: int) -> None:
-    """The blocks end between two changes, and in the midst of a cross-fade."""
+    """The blocks end between two changes, and in the midst of a cross-fade; the amplifier changes within a block."""
     plant = changing(
         fade / FS,
         0.1,
         secondary=SECONDARY,
         primary=PRIMARY,
         feedback=FEEDBACK,
-        amplifier=[(0.0, lambda y: max(-0.8, min(y, 0.8)))],  # of a sample, not of a block
+        amplifier=[(0.0, lambda y: max(-0.8, min(y, 0.8))), (0.149, HardClipAmplifier(0.4))],  # the first of a sample
     )
     interface = SimulatedInterface(X, plant, block=12, latency=24, rng=3)
     y = np.random.default_rng(5).standard_normal(N)
@@ -139,7 +139,8 @@ def test_a_simulated_interface_is_that_plant_and_changes_too(fade: int) -> None:
     while (block := interface.read()) is not None:
         interface.write(y[np.newaxis, 12 * len(blocks) : 12 * len(blocks) + 12])
         blocks.append(block)
-    played = np.concatenate((np.zeros(24), np.clip(y[:-24], -0.8, 0.8)))
+    limit = np.where(np.arange(N) < 149, 0.8, 0.4)
+    played = np.clip(np.concatenate((np.zeros(24), y[:-24])), -limit, limit)
     found = [np.concatenate([getattr(block, name)[0] for block in blocks]) for name in ("references", "errors")]
     np.testing.assert_allclose(found[0], X + single(FEEDBACK, fade, played), rtol=0, atol=1e-13)
     expected = single(PRIMARY, fade, X) - single(SECONDARY, fade, played)

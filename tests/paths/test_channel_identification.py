@@ -7,8 +7,8 @@ import scipy.signal
 from helpers.channels import delayed
 
 from kfopc_filterpy import HardClipAmplifier, Plant
+from kfopc_filterpy._taps import path_matrix
 from kfopc_filterpy.paths import estimate_path, identify_secondary_path
-from kfopc_filterpy.paths.path_matrix import path_matrix
 
 FS = 8000.0
 N_TAPS = 12

@@ -9,13 +9,14 @@ import scipy.signal
 from scipy.signal import fftconvolve, lfilter
 
 from kfopc_filterpy import Plant
+from kfopc_filterpy._taps import path_taps
 from kfopc_filterpy.paths.identification import (
     estimate_path,
     identify_secondary_path,
     misalignment_db,
     modelling_error_db,
 )
-from kfopc_filterpy.paths.models import bandpass_path, path_taps
+from kfopc_filterpy.paths.models import bandpass_path
 from kfopc_filterpy.paths.uncertainty import path_uncertainty
 
 FS = 16000.0

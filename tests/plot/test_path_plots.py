@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from kfopc_filterpy import Plant, power_constrained_wiener
+from kfopc_filterpy._taps import path_taps
 from kfopc_filterpy.bounds.wiener import wiener_solution
 from kfopc_filterpy.paths.analysis import frequency_response
 from kfopc_filterpy.paths.identification import identify_secondary_path
-from kfopc_filterpy.paths.models import bandpass_path, path_taps, perturbed_path
+from kfopc_filterpy.paths.models import bandpass_path, perturbed_path
 from kfopc_filterpy.plot.paths import (
     plot_bode,
     plot_causality_margin,

@@ -83,9 +83,9 @@ def test_a_run_identifies_fades_in_reduces_and_fades_out() -> None:
     report = started(interface, seconds=3.0, on_report=reports.append, report_every_s=0.5)
     assert report.stopped_by == "end"
     assert report.round_trip_samples == 65
-    assert report.secondary_path is not None
+    assert report.secondary is not None
     # The disturbance is twice as loud as the noise that is played, but the reference explains it.
-    np.testing.assert_allclose(report.secondary_path.taps[64:67], S, atol=1e-3)
+    np.testing.assert_allclose(report.secondary.taps[64:67], S, atol=1e-3)
     assert report.possible_db > 15.0
     assert report.reduction_db[0] > 10.0
     assert [round(r.time_s, 1) for r in reports] == [0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
@@ -105,8 +105,8 @@ def test_several_loudspeakers_and_microphones() -> None:
     primary = np.stack((PRIMARY, np.roll(0.7 * PRIMARY, 3)))[:, np.newaxis]
     interface = SimulatedInterface(X, Plant(paths, primary, fs=FS), block=32, latency=64)
     report = started(interface, step_size=1e-3, amplitude_limit=[8.0, 8.0], seconds=2.0)
-    assert report.secondary_path is not None
-    np.testing.assert_allclose(report.secondary_path.taps[:, :, 65], paths[:, :, 1], atol=1e-3)
+    assert report.secondary is not None
+    np.testing.assert_allclose(report.secondary.taps[:, :, 65], paths[:, :, 1], atol=1e-3)
     assert np.all(report.reduction_db > 6.0)
 
 
@@ -136,10 +136,10 @@ def test_a_run_with_an_internal_model(several: bool, white: float) -> None:
 
     report = run(make, interface, amplitude_limit=8.0, seconds=3.0, listen_s=0.5, identify_s=2.0)
     assert report.stopped_by == "end"
-    assert report.secondary_path is not None
-    exact = np.zeros_like(report.secondary_path.taps)
+    assert report.secondary is not None
+    exact = np.zeros_like(report.secondary.taps)
     exact[..., : 64 + np.shape(paths)[-1]] = interface.total_plant.secondary
-    assert np.linalg.norm(report.secondary_path.taps - exact) < 0.02 * np.linalg.norm(exact)
+    assert np.linalg.norm(report.secondary.taps - exact) < 0.02 * np.linalg.norm(exact)
     assert report.possible_db > 15.0
     assert np.all(report.reduction_db > 15.0)
     assert not report.health.counts
@@ -285,7 +285,7 @@ def test_a_run_stops_on_a_fault_when_told_to_and_on_ctrl_c() -> None:
     settings: dict[str, Any] = {"amplitude_limit": 3.0, "listen_s": 0.5, "pause_s": 0.1, "check_causality": False}
     report = run(wrong, plant(), **settings)
     assert report.stopped_by == "fault: 3 divergences"
-    assert report.secondary_path is None
+    assert report.secondary is None
     blocks: list[int] = []
 
     def enough() -> bool:
