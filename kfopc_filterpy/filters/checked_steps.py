@@ -24,7 +24,8 @@ SILENT_REFERENCE = (
     "Nothing was changed"
 )
 NOT_FINITE = (
-    "{} would hold NaN or Inf: look for them, or for values that overflow, in x, P, F, Q, R, H, M, K before this step"
+    "{} would hold NaN, Inf or masked values: look for them, or for values that overflow, in x, P, F, Q, R, H, M, K before "
+    "this step"
 )
 
 Checks = Callable[..., Any]  # of the arguments of a step, with the filter before them
@@ -76,10 +77,10 @@ def _require_sound(kf: KalmanFilter) -> None:
     if np.shape(kf.x) not in ((n, 1), (n,)) or np.shape(kf.P) not in ((), (n, n)):
         raise ValueError(f"x would become {np.shape(kf.x)} and P {np.shape(kf.P)}, for dim_x = {n}")
     for key in ("x", "P"):
-        value = np.asarray(getattr(kf, key))
+        value = np.ma.asarray(getattr(kf, key))
         if value.dtype.kind not in "biuf":
             raise TypeError(f"{key} would become an array of {value.dtype}, but needs real numbers")
-        if not np.isfinite(value).all():
+        if np.ma.is_masked(value) or not np.isfinite(value.data).all():
             raise ValueError(NOT_FINITE.format(key))
 
 
@@ -117,7 +118,7 @@ def checked_measurement(
     row = np.reshape(given, (1, -1)) if np.ndim(given) < 2 else np.asarray(given)
     if row.ndim != 2 or row.shape[1] != n:
         raise ValueError(f"H must have shape ({n},) or (dim_z, {n}), got {np.shape(given)}")
-    as_finite_array(row, "H")
+    as_finite_array(given, "H")
     rows = len(row)
     require_measurement(z, rows)
     noise = kf.R if R is None else R
@@ -256,6 +257,8 @@ def require_semidefinite(value: ArrayLike, name: str) -> None:
 
     NaN, Inf and wrong shapes pass: the step that uses them refuses them.
     """
+    if np.ma.is_masked(value):
+        raise ValueError(f"{name} must not be masked: a variance that is not known has no number")
     P = np.atleast_2d(as_real_array(value, name))
     if P.ndim != 2 or P.shape[0] != P.shape[1] or (P.tobytes() == P.T.tobytes() and _is_definite(P)):
         return

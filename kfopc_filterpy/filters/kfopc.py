@@ -363,8 +363,10 @@ class KFOPC(KalmanFilter, Checkpointed):
         if not hasattr(KalmanFilter, "update_sequential"):
             raise AttributeError("this filterpy has no update_sequential: it needs filterpy 2.0.0 or later")
         length = np.size(z_i)
-        if not 0 <= start <= self.dim_z - length:
-            raise ValueError(f"start must be 0 to dim_z - len(z_i) = {self.dim_z - length}, got {start}")
+        if not 0 <= start <= start + length <= self.dim_z:
+            raise ValueError(
+                f"z_i must stay within the dim_z = {self.dim_z} measurements, got {length} from start = {start} on"
+            )
         checked_steps.require_measurement(z_i, length)
         rows = self.H[start : start + length] if H_i is None else np.reshape(H_i, (length, self.dim_x))
         require_finite(rows, "H_i")
@@ -672,10 +674,11 @@ class KFOPC(KalmanFilter, Checkpointed):
             raise ValueError(f"Xs must be (n, {size}[, 1]) and Ps (n, {size}, {size}), got {x.shape} and {P.shape}")
         if self.alpha != 1.0:
             raise ValueError(f"alpha must be 1, got {self.alpha:g}: filterpy's smoother leaves the fading memory out")
-        if us is None and self._moved:
+        without_B = Bs is None and self.B is None
+        if self._moved and (us is None or (without_B and any(u is not None and np.any(u) for u in us))):
             raise ValueError(
-                "us= is missing: control inputs moved this filter, and filterpy's smoother leaves them out. "
-                "Pass us= and Bs= as to batch_filter, or us=[0] * n if none moved it in these samples"
+                f"{'us=' if us is None else 'Bs='} is missing: control inputs moved this filter, and filterpy's smoother "
+                "leaves them out. Pass us= and Bs= as to batch_filter, or us=[0] * n if none moved it in these samples"
             )
         for name, given in (("Fs", Fs), ("Qs", Qs)):
             if given is not None:
@@ -688,7 +691,13 @@ class KFOPC(KalmanFilter, Checkpointed):
             smoothed = x.copy()
             for k in range(n - 1, 0, -1):
                 checked_steps.require_control(self, us[k], B[k])
-                moved = 0.0 if us[k] is None or B[k] is None else np.reshape(np.dot(B[k], us[k]), x[k].shape)
+                moved: Any = 0.0 if us[k] is None or B[k] is None else np.dot(B[k], us[k])
+                if np.ndim(moved) > 0:
+                    if np.size(moved) != size:
+                        raise ValueError(
+                            f"us and Bs must move {size} states, but those of step {k} move {np.size(moved)}"
+                        )
+                    moved = np.reshape(moved, x[k].shape)
                 smoothed[k - 1] += np.dot(K[k - 1], smoothed[k] - np.dot(F[k], x[k - 1]) - moved)
         return smoothed, P, K, Pp
 
@@ -755,7 +764,8 @@ class KFOPC(KalmanFilter, Checkpointed):
     def _take_in_edits(self) -> None:
         """Check P if it was assigned or written into since the last step, so that other steps do not pay for it."""
         P = np.asarray(self.P).tobytes()
-        if np.asarray(self.P_post).tobytes() != P and np.asarray(self.P_prior).tobytes() != P:
+        known = P in (np.asarray(self.P_post).tobytes(), np.asarray(self.P_prior).tobytes())
+        if not known or type(self.P) is not np.ndarray:
             self._require_covariance()
 
     def _require_covariance(self) -> None:

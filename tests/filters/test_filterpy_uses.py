@@ -222,25 +222,29 @@ def test_the_imm_of_the_fork_runs_KFOPCs() -> None:
     assert same(*(interacting_models(kind, fork.IMMEstimator) for kind in (fork.KalmanFilter, KFOPC)))
 
 
-def test_the_smoother_takes_the_inputs_that_filterpys_leaves_out() -> None:
+def test_the_smoother_takes_gaps_and_the_inputs_that_filterpys_leaves_out() -> None:
     """The oracle is least squares over all states, noises and measurements at once."""
     n, rng = 6, np.random.default_rng(3)
-    F, B, H = np.array([[1.0, 0.5], [0.0, 0.9]]), np.array([[0.1], [1.0]]), np.array([[1.0, 0.3]])
-    us, z = rng.normal(size=(n, 1, 1)) * 10.0, rng.normal(size=n)
-    kf = KFOPC(2, 1, 1)
-    kf.F, kf.B, kf.H, kf.Q, kf.R = F, B, H, np.diag([0.1, 0.2]), np.array([[0.5]])
+    F, B, H = np.array([[1.0, 0.5], [0.0, 0.9]]), np.array([[0.1], [1.0]]), np.array([[1.0, 0.3], [0.2, 2.0]])
+    us, hidden = rng.normal(size=(n, 1, 1)) * 10.0, np.arange(2 * n).reshape(n, 2) % 5 == 3
+    hidden[4] = True
+    z = np.ma.array(rng.normal(size=(n, 2)), mask=hidden)
+    kf = KFOPC(2, 2, 1)
+    kf.F, kf.B, kf.H, kf.Q, kf.R = F, B, H, np.diag([0.1, 0.2]), np.diag([0.5, 0.4])
     means, covariances, _, _ = kf.batch_filter(z, us=us)
     smoothed, P, _, _ = kf.rts_smoother(means, covariances, us=us)
     # x(0) = F x0 + B u(0) + w with x0 ~ (0, I); x(k) = F x(k-1) + B u(k) + w; z = H x + v
     start = np.linalg.cholesky(np.linalg.inv(F @ F.T + kf.Q)).T
     noise = np.linalg.cholesky(np.linalg.inv(kf.Q)).T
-    A, b = np.zeros((3 * n, 2 * n)), np.zeros(3 * n)
+    A, b = np.zeros((4 * n, 2 * n)), np.zeros(4 * n)
     for k in range(n):
         rows, own = slice(2 * k, 2 * k + 2), start if k == 0 else noise
         A[rows, rows], b[rows] = own, own @ (B @ us[k]).ravel()
         if k:
             A[rows, 2 * k - 2 : 2 * k] = -own @ F
-        A[2 * n + k, rows], b[2 * n + k] = H[0] / 0.5**0.5, z[k] / 0.5**0.5
+        measured = slice(2 * n + 2 * k, 2 * n + 2 * k + 2)
+        weights = ~hidden[k] / np.sqrt([0.5, 0.4])
+        A[measured, rows], b[measured] = weights[:, None] * H, weights * z.data[k]
     states = np.linalg.lstsq(A, b, rcond=None)[0]
     np.testing.assert_allclose(smoothed.ravel(), states, rtol=1e-9)
     np.testing.assert_allclose(P[2], np.linalg.inv(A.T @ A)[4:6, 4:6], rtol=1e-9)

@@ -104,11 +104,12 @@ def faults_of_other_steps() -> dict[str, Fault]:
     def smooth(f: KFOPC, **kwargs: Any) -> None:
         f.rts_smoother(**{"Xs": np.ones((3, TAPS, 1)), "Ps": [np.eye(TAPS)] * 3} | kwargs)
 
-    def moved(f: KFOPC) -> None:
+    def moved(f: KFOPC, **inputs: Any) -> None:
         twin = copy.deepcopy(f)
         twin.rated_power = None
         twin.predict(u=1.0, B=np.ones((TAPS, 1)))
-        smooth(twin)
+        smooth(twin, us=[0.0] * 3)
+        smooth(twin, **inputs)
 
     short = {"Fs": np.eye(TAPS), "Qs": 0.1, "Hs": ROW, "Rs": 0.1, "us": 0.0}
     return {
@@ -116,12 +117,12 @@ def faults_of_other_steps() -> dict[str, Fault]:
         "predict: F of another size": (lambda f: f.predict(F=np.eye(TAPS + 1)), "F"),
         "predict: F as a ragged list": (lambda f: f.predict(F=[[1.0], [1.0, 0.0]]), "F must be .*differ in length"),
         "predict: F complex": (lambda f: f.predict(F=1j), "F"),
-        "predict: overflow": (lambda f: f.predict(F=1e200 * np.eye(TAPS)), "NaN or Inf|F must be"),
+        "predict: overflow": (lambda f: f.predict(F=1e200 * np.eye(TAPS)), "NaN, Inf|F must be"),
         "predict: Q beyond a float": (lambda f: f.predict(Q=10**400), "Q"),
         "predict: Q negative": (lambda f: f.predict(Q=-1.0), "Q"),
         "predict: Q of another size": (lambda f: f.predict(Q=np.eye(2)), "Q"),
         "predict: Q with a negative variance": (lambda f: f.predict(Q=np.diag([1.0, 1, -1, 1, 1])), "Q"),
-        "predict: P would overflow": (lambda f: f.batch_filter([None] * 2, Qs=[1.5e308] * 2), "overflow|NaN or Inf"),
+        "predict: P would overflow": (lambda f: f.batch_filter([None] * 2, Qs=[1.5e308] * 2), "overflow|NaN, Inf"),
         "predict: u NaN": (lambda f: f.predict(u=NAN, B=np.ones((TAPS, 1))), "u"),
         "predict: B of another size": (lambda f: f.predict(u=np.ones((1, 1)), B=np.ones((TAPS + 1, 1))), "shape"),
         "predict: x broadcast": (lambda f: f.predict(u=np.ones((1, 3)), B=np.ones((TAPS, 1))), "x would become"),
@@ -169,7 +170,12 @@ def faults_of_other_steps() -> dict[str, Fault]:
         "rts_smoother: Q of another length": (lambda f: smooth(f, Qs=[np.eye(TAPS)] * 4), "Qs must have shape"),
         "rts_smoother: fading memory": (lambda f: changed(f, "alpha", 1.1, lambda: smooth(f)), "alpha must be 1"),
         "rts_smoother: u missing": (moved, "us= is missing: control inputs moved this filter"),
+        "rts_smoother: B missing": (lambda f: moved(f, us=[0.0, None, 1.0]), "Bs= is missing: control inputs moved"),
         "rts_smoother: u of another length": (lambda f: smooth(f, us=[0.0]), "us and Bs must have 3 values"),
+        "rts_smoother: B of another size": (
+            lambda f: smooth(f, us=[1.0] * 3, Bs=[np.ones((2, 1))] * 3),
+            "us and Bs must move 5 states, but those of step 2 move 2",
+        ),
         "rts_smoother: u NaN": (lambda f: smooth(f, us=[NAN] * 3, Bs=[np.ones((TAPS, 1))] * 3), "u must be finite"),
         "alpha NaN": (lambda f: setattr(f, "alpha", NAN), "alpha"),
         "alpha whose square overflows": (lambda f: setattr(f, "alpha", 1e200), "alpha"),
@@ -418,7 +424,7 @@ def test_update_sequential_stays_within_the_measurements() -> None:
     kf = KFOPC(3, 2)
     kf.H = np.eye(2, 3)
     for start, z in ((-1, 1.0), (2, 1.0), (1, [1.0, 2.0])):
-        with pytest.raises(ValueError, match="start"):
+        with pytest.raises(ValueError, match=r"z_i must stay within the dim_z = 2 measurements, got [12] from start"):
             kf.update_sequential(start, z, R_i=1.0, H_i=np.ones((np.size(z), 3)))
 
 
