@@ -48,9 +48,9 @@ def test_thousands_of_steps_as_filterpy(n: int, kind: str, P0: float, alpha: flo
 def test_the_core_computes_the_same_in_a_controller(limited: bool) -> None:
     """To 1e-9: the core stores P as one triangle, and sums in another order."""
     S, noises, rng = [0.0, 1.0, -0.4], {"state_noise": 1e-6, "measurement_noise": 0.01}, np.random.default_rng(2)
-    rated: Any = {"rated_power": 0.5} if limited else {}
+    rated: Any = {"rated_power": 0.5, "fs": 16000} if limited else {}
     numpys = KalmanController(KFOPC.random_walk(24, **noises, **rated), S)
-    cores = kf_opc(24, S, fs=16000, **noises, **rated) if limited else kf_anc(24, S, **noises)
+    cores = kf_opc(24, S, **noises, **rated) if limited else kf_anc(24, S, **noises)
     x = np.convolve(rng.normal(size=3000), np.hanning(7))
     d, played = 2.0 * np.roll(x, 5) - 0.7 * np.roll(x, 9), np.zeros((2, 3))  # newest control signal first
     for n in range(2000):
