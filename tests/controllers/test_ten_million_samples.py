@@ -1,6 +1,6 @@
 """Controllers over ten million samples of each of five noises, without state noise: arithmetic alone keeps P in order.
 
-`KFOPC_TABLES=docs pytest -m slow tests/controllers/test_ten_million_samples.py` writes the table of docs/soak.md.
+`KFOPC_TABLES=docs pytest -m slow tests/controllers/test_ten_million_samples.py` writes the table of docs/limits.md.
 """
 
 from __future__ import annotations
