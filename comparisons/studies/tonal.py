@@ -11,6 +11,7 @@ import numpy as np
 from kfopc_filterpy import HardClipAmplifier, Plant, SimulationResult, bandpass_path, plot
 from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.metrics import peak_control_signal
+from kfopc_filterpy.plot.style import labelled
 from kfopc_filterpy.signals import tone
 
 from .. import bench
@@ -192,15 +193,21 @@ def _figures_of(
 
     def weights(setting: Setting, group: Sequence[SimulationResult]) -> Callable[[Any], None]:
         def panel(ax: Any) -> None:
-            plot.plot_weight_history(group, tap=tap, ax=ax).set_yscale("linear")  # a straight line is the point
-            ax.autoscale(axis="y")
+            for run in group:
+                assert run.weights is not None
+                style = plot.curve_style(run.algorithm) | {"marker": ""}
+                ax.plot(run.weights_time_s, run.weights[:, tap], label=run.algorithm, **style)
+            labelled(ax, xlabel="Time (s)", ylabel=f"Weight {tap} of the control filter")
             ax.set_title(f"$r\\,E[x'^2]/q$ = {setting:g}", pad=22, fontsize="medium")  # above the legend
 
         return panel
 
     def overdrive(ax: Any) -> None:
-        plot.plot_noise_reduction_against_overdrive(OVERDRIVES_DB, sweep, flip_db=crossings, ax=ax)
-        ax.set_ylim(0, 25)
+        for name, levels in sweep.items():
+            ax.plot(OVERDRIVES_DB, levels, label=name, **plot.curve_style(name))
+        for crossing in crossings:
+            ax.axvline(crossing, label=f"Order flips at {crossing:.1f} dB", color="0.15", linestyle=":")
+        labelled(ax, xlabel="Overdrive (dB)", ylabel="Noise reduction (dB)").set_ylim(0, 25)
 
     return [
         parts.draw(

@@ -5,9 +5,7 @@ from .power_constrained import ControlFilters as ControlFilters
 from .power_constrained import PowerConstrainedWiener as PowerConstrainedWiener
 from .power_constrained import power_constrained_solution as power_constrained_solution
 from .prediction import predictor_reference as predictor_reference
-from .rated_power import BudgetedRatedPower as BudgetedRatedPower
-from .rated_power import RatedPower as RatedPower
-from .rated_power import budgeted_rated_power as budgeted_rated_power
+from .rated_power import RequiredRatedPower as RequiredRatedPower
 from .rated_power import required_rated_power as required_rated_power
 from .settings import SuggestedSettings as SuggestedSettings
 from .wiener import WienerSolution as WienerSolution

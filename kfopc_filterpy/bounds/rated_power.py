@@ -1,14 +1,13 @@
-"""Rated power needed for a noise reduction: with a scaled control filter, and with the power spent in the best way."""
+"""Rated power needed for a noise reduction if the power is spent in the best way."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validate import as_choice, as_finite_array, as_positive, per_loudspeaker
+from .._validate import as_choice, as_finite_array, per_loudspeaker
 from ..plant import Plant, as_constant_plant, checked_signals, has_one_channel
 from .channel_bound import ChannelCorrelations, channel_record
 from .wiener import reduction_db
@@ -17,28 +16,8 @@ ROUNDING_DB = 1e-9  # tolerance above the largest attainable noise reduction: it
 
 
 @dataclass(frozen=True)
-class RatedPower:
-    """Rated power needed for given noise reductions.
-
-    Attributes
-    ----------
-    noise_reduction_db : numpy.ndarray
-        Noise reductions wanted, in dB.
-    constraint_factor : numpy.ndarray
-        Scaling α of the Wiener filter that reaches each of them; 1 if it is out of reach.
-    rated_power : numpy.ndarray
-        Rated power (mean square) needed; infinite if the noise reduction is out of reach. With several loudspeakers,
-        the last axis is the loudspeaker.
-    """
-
-    noise_reduction_db: np.ndarray
-    constraint_factor: np.ndarray
-    rated_power: np.ndarray
-
-
-@dataclass(frozen=True)
-class BudgetedRatedPower:
-    """Rated power needed for given noise reductions if it is spent in the best way; see `budgeted_rated_power`.
+class RequiredRatedPower:
+    """Rated power needed for given noise reductions if it is spent in the best way; see `required_rated_power`.
 
     Attributes
     ----------
@@ -62,102 +41,6 @@ class BudgetedRatedPower:
 
 def required_rated_power(
     noise_reduction_db: ArrayLike,
-    *,
-    disturbance_power: float,
-    antinoise_power: float,
-    control_power: ArrayLike,
-    beyond: str = "raise",
-) -> RatedPower:
-    r"""Return the rated power that KF-OPC needs to reach a noise reduction.
-
-    KF-OPC scales the measurement by α (eq. 9), and so in the steady state scales the Wiener filter by α. With control
-    power :math:`P_w` and anti-noise power A of the Wiener filter, and disturbance power D,
-
-    .. math:: J(α) = D - (2α - α^2) A, \qquad ρ_o = α^2 P_w.
-
-    Parameters
-    ----------
-    noise_reduction_db : float or array_like
-        Noise reductions wanted in dB, zero or above.
-    disturbance_power, antinoise_power : float
-        D and A: the attributes of a `WienerSolution` computed without a penalty.
-    control_power : float or array_like, shape (J,)
-        P_w: likewise, for one loudspeaker or for each of several. Each then needs :math:`α^2 P_j`, since one factor
-        scales all.
-    beyond : {"raise", "inf"}, default "raise"
-        Whether noise reductions that the Wiener filter itself does not attain raise an error or need infinite power.
-
-    Returns
-    -------
-    RatedPower
-        Rated power and constraint factor, of the shape of `noise_reduction_db`. With several loudspeakers the rated
-        power has an axis (J,) added.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a noise reduction is negative or out of reach, or a power is not positive. With several loudspeakers, the
-        control power may be zero for some, but not for all.
-
-    See Also
-    --------
-    budgeted_rated_power : Rated power needed if it is spent in the best way, which KF-PB approaches.
-
-    Examples
-    --------
-    >>> needed = required_rated_power(
-    ...     [6.0, 20.0], disturbance_power=1.0, antinoise_power=0.99, control_power=2.0
-    ... )
-    >>> needed.rated_power.round(3)
-    array([0.513, 2.   ])
-    """
-    disturbance = as_positive(disturbance_power, "disturbance_power")
-    antinoise = as_positive(antinoise_power, "antinoise_power")
-    control = _control_power(control_power)
-    as_choice(beyond, "beyond", ("raise", "inf"))
-    if antinoise > disturbance * (1 + 1e-9):
-        raise ValueError(
-            f"antinoise_power must not exceed disturbance_power, got {antinoise:g} and {disturbance:g}: "
-            "these are not the powers of a Wiener filter computed without a penalty"
-        )
-    wanted = _wanted(noise_reduction_db)
-
-    # 2α - α² = (D - J)/A has the smaller root α = 1 - sqrt(1 - (D - J)/A).
-    share = disturbance * (1 - 10 ** (-wanted / 10)) / antinoise
-    # The Wiener filter's own noise reduction is in reach, whichever way its last digit was rounded.
-    attainable = share <= 1 + 1e-9
-    if beyond == "raise" and not np.all(attainable):
-        remaining = max(1 - antinoise / disturbance, 1e-30)
-        raise ValueError(
-            f"noise_reduction_db must not exceed what the Wiener filter attains, "
-            f"{-10 * np.log10(remaining):.2f} dB, got {wanted.max():g} dB; "
-            "use a longer control filter, or beyond='inf' to mark such values"
-        )
-    factor = 1 - np.sqrt(np.clip(1 - share, 0, 1))
-    each = (slice(None),) * wanted.ndim + (np.newaxis,) * np.ndim(control)
-    return RatedPower(wanted, factor, np.where(attainable[each], factor[each] ** 2 * control, np.inf))
-
-
-def _control_power(value: Any) -> Any:
-    """Return a positive number, or powers (J,) of which at least one is positive."""
-    if np.ndim(value) != 1:
-        return as_positive(value, "control_power")
-    powers = as_finite_array(value, "control_power")
-    if np.any(powers < 0) or not np.any(powers > 0):
-        raise ValueError(f"control_power must not be negative, and at least one must be greater than 0, got {powers}")
-    return powers
-
-
-def _wanted(noise_reduction_db: Any) -> np.ndarray:
-    """Return the noise reductions wanted, finite and not negative."""
-    wanted = as_finite_array(noise_reduction_db, "noise_reduction_db")
-    if np.any(wanted < 0):
-        raise ValueError(f"noise_reduction_db must not be negative, got {wanted.min():g} dB")
-    return wanted
-
-
-def budgeted_rated_power(
-    noise_reduction_db: ArrayLike,
     reference: ArrayLike,
     plant: Plant,
     *,
@@ -165,12 +48,12 @@ def budgeted_rated_power(
     disturbance: ArrayLike | None = None,
     proportions: ArrayLike | None = None,
     beyond: str = "raise",
-) -> BudgetedRatedPower:
+) -> RequiredRatedPower:
     """Return the rated power needed for a noise reduction if the power is spent in the best way.
 
     All loudspeakers have the same rated power, or rated powers in given proportions. The result is the smallest rated
     power with which `power_constrained_wiener` reaches the noise reduction over the record. KF-PB comes close to this
-    bound. `required_rated_power` gives the rated power needed if the control filter is only scaled.
+    bound. KF-OPC scales its control filter as a whole, and needs more.
 
     Parameters
     ----------
@@ -192,7 +75,7 @@ def budgeted_rated_power(
 
     Returns
     -------
-    BudgetedRatedPower
+    RequiredRatedPower
         The rated powers, the powers that are used, and the weights that show which rated power limits most.
 
     Raises
@@ -211,11 +94,11 @@ def budgeted_rated_power(
     Two loudspeakers of the same rated power, and two microphones:
 
     >>> from kfopc_filterpy import Plant, power_constrained_wiener
-    >>> from kfopc_filterpy.bounds import budgeted_rated_power
+    >>> from kfopc_filterpy.bounds import required_rated_power
     >>> x = np.random.default_rng(0).standard_normal(4000)
     >>> paths = [[[0, 1.0, 0.6], [0, 0.3, 0.3]], [[0, 0.4, 0.1], [0, 1.0, -0.5]]]
     >>> plant = Plant(paths, [[0, 0, 1.0, 0.5], [0, 0, 0.8, -0.2]], fs=8000)
-    >>> needed = budgeted_rated_power([3.0, 10.0], x, plant, n_taps=8)
+    >>> needed = required_rated_power([3.0, 10.0], x, plant, n_taps=8)
     >>> needed.rated_power.round(3)
     array([[0.033, 0.033],
            [0.194, 0.194]])
@@ -224,8 +107,10 @@ def budgeted_rated_power(
     10.00 dB, scaled 5.99 dB
     """
     as_choice(beyond, "beyond", ("raise", "inf"))
-    wanted = _wanted(noise_reduction_db)
-    as_constant_plant(plant, "budgeted_rated_power")
+    wanted = as_finite_array(noise_reduction_db, "noise_reduction_db")
+    if np.any(wanted < 0):
+        raise ValueError(f"noise_reduction_db must not be negative, got {wanted.min():g} dB")
+    as_constant_plant(plant, "required_rated_power")
     x, d = checked_signals(plant, reference, disturbance)
     record = channel_record(x, d, plant.secondary, n_taps).with_sound()
     shares = per_loudspeaker(1.0 if proportions is None else proportions, record.shape[0], "proportions")
@@ -237,7 +122,7 @@ def budgeted_rated_power(
         )
     found = np.array([search.powers(one) for one in wanted.ravel()])  # (n, 3, J)
     each = np.moveaxis(found, 1, 0).reshape(3, *wanted.shape, -1)
-    return BudgetedRatedPower(wanted, *(each[..., 0] if has_one_channel(plant, x) else each))
+    return RequiredRatedPower(wanted, *(each[..., 0] if has_one_channel(plant, x) else each))
 
 
 class _ScaleSearch:

@@ -1,4 +1,4 @@
-"""Analysis of paths: responses in Hz, group delay, gain (eq. 11), phase error, achieved band, causality margin."""
+"""Analysis of paths: responses in Hz, gain (eq. 11), achieved band, causality margin."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ from .._types import PathModel
 from .._validate import as_band, as_number, as_positive, as_signal
 from ..plant import Plant, as_constant_plant, has_one_channel
 from .file_checks import require_sound
-
-STABILITY_BOUND_DEG = 90.0
-"""Phase error of the estimate beyond which filtered-reference adaptation diverges, in degrees."""
 
 
 def frequency_response(path: PathModel, frequencies_hz: ArrayLike, *, fs: float | None = None) -> np.ndarray:
@@ -69,60 +66,12 @@ def _response_on_grid(path: Any, n_frequencies: int) -> np.ndarray:
     return np.fft.rfft(padded.reshape(-1, period).sum(axis=0))
 
 
-def responses_of_both(
-    path: PathModel, estimate: PathModel, frequencies_hz: ArrayLike, fs: float | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frequency responses of a path and an estimate of it, which must have the same sampling rate."""
-    fs = sampling_rate(path, fs)
-    sampling_rate(estimate, fs, name="estimate")
-    return frequency_response(path, frequencies_hz, fs=fs), frequency_response(estimate, frequencies_hz, fs=fs)
-
-
 def _radians(frequencies_hz: Any, fs: float) -> np.ndarray:
     """Return frequencies in Hz as radians per sample."""
     f = as_signal(frequencies_hz, "frequencies_hz")
     if f.min() < 0 or f.max() > fs / 2:
         raise ValueError(f"frequencies_hz must lie within 0 to fs/2 = {fs / 2:g} Hz, got {f.min():g} to {f.max():g} Hz")
     return 2 * np.pi * f / fs
-
-
-def group_delay(path: PathModel, frequencies_hz: ArrayLike, *, fs: float | None = None) -> np.ndarray:
-    """Return the group delay of a path, ``-d(phase)/d(omega)``, in seconds.
-
-    Parameters
-    ----------
-    path : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
-        As for `frequency_response`; an infinite response is differentiated numerically, to about 1e-6 samples.
-    frequencies_hz : array_like, shape (n_frequencies,)
-        Frequencies in Hz, within 0 to fs/2.
-    fs : float, optional
-        Sampling rate in Hz, needed for a tap array.
-
-    Returns
-    -------
-    numpy.ndarray, shape (n_frequencies,)
-        Group delay in s; NaN at a zero of the response, where it is undefined.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As for `frequency_response`.
-
-    Examples
-    --------
-    >>> float(group_delay([0.0, 0.0, 1.0], [1000.0], fs=8000.0)[0])  # two samples
-    0.00025
-    """
-    fs = sampling_rate(path, fs)
-    omega, taps = _radians(frequencies_hz, fs), finite_taps(path)
-    if taps is None:
-        step = 1e-4
-        before, after = _response(path, omega - step), _response(path, omega + step)
-        return np.angle(before * np.conj(after)) / (2 * step * fs)
-    response = _response(taps, omega)
-    ramped = _response(taps * np.arange(taps.size), omega)  # transform of n h[n]
-    heard = np.abs(response) > 1e-12 * np.sum(np.abs(taps))
-    return np.where(heard, np.real(ramped / np.where(heard, response, 1.0)), np.nan) / fs
 
 
 def secondary_path_gain(
@@ -184,69 +133,6 @@ def secondary_path_gain(
     lags, autocorrelation = np.arange(taps.size), correlate(taps, taps)[taps.size - 1 :]
     mean_cosine = (high * np.sinc(2 * lags * high / fs) - low * np.sinc(2 * lags * low / fs)) / (high - low)
     return float(autocorrelation[0] + 2 * autocorrelation[1:] @ mean_cosine[1:])
-
-
-@dataclass(frozen=True)
-class PhaseError:
-    """Phase of an estimate of a path relative to the path.
-
-    Attributes
-    ----------
-    frequencies_hz : numpy.ndarray, shape (n_frequencies,)
-        Frequencies in Hz.
-    error_deg : numpy.ndarray, shape (n_frequencies,)
-        Phase of the estimate minus that of the path in degrees, within -180 to 180.
-    bound_deg : float
-        Stability bound in degrees: adaptation diverges at frequencies where the magnitude of the error exceeds it.
-    """
-
-    frequencies_hz: np.ndarray
-    error_deg: np.ndarray
-    bound_deg: float = STABILITY_BOUND_DEG
-
-    @property
-    def within_bound(self) -> np.ndarray:
-        """Tell for each frequency whether it lies within the stability bound, shape (n_frequencies,)."""
-        return np.abs(self.error_deg) < self.bound_deg
-
-
-def phase_error(
-    path: PathModel, estimate: PathModel, frequencies_hz: ArrayLike, *, fs: float | None = None
-) -> PhaseError:
-    """Return the phase error of a secondary-path estimate, with the 90 degree stability bound.
-
-    Parameters
-    ----------
-    path, estimate : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
-        True path and its estimate.
-    frequencies_hz : array_like, shape (n_frequencies,)
-        Frequencies in Hz, within 0 to fs/2.
-    fs : float, optional
-        Sampling rate in Hz, needed for tap arrays.
-
-    Returns
-    -------
-    PhaseError
-        Errors in degrees and the bound.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As for `frequency_response`, or if the paths differ in sampling rate.
-
-    References
-    ----------
-    .. [1] D. Morgan, IEEE Trans. Acoust. Speech Signal Process. 28(4), 1980.
-
-    Examples
-    --------
-    >>> error = phase_error([1.0, 0.0], [0.0, 1.0], [1000.0, 3000.0], fs=8000.0)  # one sample late
-    >>> error.error_deg.round(6), error.within_bound
-    (array([ -45., -135.]), array([ True, False]))
-    """
-    true, estimated = responses_of_both(path, estimate, frequencies_hz, fs)
-    error = np.rad2deg(np.angle(estimated * np.conj(true)))
-    return PhaseError(as_signal(frequencies_hz, "frequencies_hz"), error)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Figures of runs over time: convergence, output power, constraint factor, weights; and figures of a study.
+"""Figures of runs over time: convergence, output power, constraint factor.
 
 These rules hold for the functions here and in `kfopc_filterpy.plot.signals`:
 
@@ -19,17 +19,15 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, as_signal
+from .._validate import as_choice, as_positive, as_sample_count
 from .._writing import made_folder, replacing
 from ..metrics import nse_db, short_time_power
-from .results import DISTURBANCE, RATED, Curve, Results, curves, named_styles, one_channel, thinned
+from .results import DISTURBANCE, RATED, Curve, Results, curves, one_channel, thinned
 from .style import labelled, new_axes
 
 if TYPE_CHECKING:
@@ -37,67 +35,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..loop.result import SimulationResult
-
-
-def plot_weight_history(results: Results, *, tap: int | tuple[int, int, int], ax: Axes | None = None) -> Axes:
-    """Draw the history of one weight of each control filter (the paper's Fig. 5 d).
-
-    If one curve grows to more than 100 times the smallest, the axis is logarithmic beyond the smallest.
-
-    Parameters
-    ----------
-    results : SimulationResult, sequence or mapping
-        Runs with their weights recorded, one per name.
-    tap : int or (int, int, int)
-        Index of the weight, from 0; with several channels (loudspeaker, reference, tap).
-    ax : matplotlib.axes.Axes, optional
-        Axes to draw into, by default new ones.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        The axes drawn into.
-
-    Raises
-    ------
-    ValueError
-        If the weights were not recorded, or a filter does not have the tap.
-
-    Examples
-    --------
-    >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import Plant, fx_lms, simulate
-    >>> from kfopc_filterpy.signals import tone
-    >>> x, controller = tone(400.0, 0.1, fs=16000), fx_lms(8, [1.0], step_size=0.01)
-    >>> result = simulate(controller, x, Plant([1.0], [0.5], fs=16000), record_weights_every=16)
-    >>> ax = plot_weight_history(result, tap=3)
-    >>> ax.get_ylabel()
-    'Weight 3 of the control filter'
-    >>> plt.close(ax.figure)
-    """
-    shown = curves(results, single=True)
-    index: tuple[Any, ...] = tuple(as_count(i, "tap", minimum=0) for i in np.atleast_1d(np.asarray(tap, dtype=object)))
-    histories = []
-    for curve in shown:
-        weights = curve.run.weights
-        if weights is None:
-            raise ValueError(f"results {curve.label!r} hold no weights; simulate with record_weights_every=16")
-        if len(index) != weights.ndim - 1:
-            expected = "an index" if weights.ndim == 2 else "(loudspeaker, reference, tap)"
-            raise ValueError(f"tap must be {expected} for the weights of {curve.label!r}, got {tap!r}")
-        if any(i >= n for i, n in zip(index, weights.shape[1:], strict=True)):
-            held = weights.shape[1] if weights.ndim == 2 else weights.shape[1:]
-            raise ValueError(f"tap must be below the {held} weights of {curve.label!r}, got {tap}")
-        histories.append(weights[(slice(None), *index)])
-    ax = new_axes(ax)
-    for curve, history in zip(shown, histories, strict=True):
-        rows = thinned(history.size)
-        ax.plot(np.asarray(curve.run.weights_time_s)[rows], history[rows], **curve.line())
-    peaks = [np.max(np.abs(history), initial=0.0, where=~np.isnan(history)) for history in histories]
-    smallest = min((peak for peak in peaks if peak > 0), default=0.0)
-    if max(peaks) > 100 * smallest:
-        ax.set_yscale("symlog", linthresh=smallest)
-    return _over_time(ax, shown, f"Weight {tap} of the control filter")
 
 
 def plot_nse(
@@ -309,65 +246,6 @@ def plot_constraint_factor(results: Results, *, channel: int | None = None, ax: 
         curve.draw(ax, factor, i)
     ax.set_ylim(0, 1.05)
     return _over_time(ax, shown, "Constraint factor α")
-
-
-def plot_noise_reduction_against_overdrive(
-    overdrive_db: ArrayLike,
-    noise_reduction_db: Mapping[str, Any],
-    *,
-    flip_db: ArrayLike | None = None,
-    ax: Axes | None = None,
-) -> Axes:
-    """Draw the noise reduction over the overdrive, the power that full control needs over the rated power.
-
-    Parameters
-    ----------
-    overdrive_db : array_like, shape (n,)
-        Overdrive in dB.
-    noise_reduction_db : mapping of str to array_like, shape (n,)
-        Noise reduction in dB by algorithm; NaN where it diverged.
-    flip_db : float or sequence of float, optional
-        Overdrive in dB at which the order of the algorithms flips, to mark.
-    ax : matplotlib.axes.Axes, optional
-        Axes to draw into, by default new ones.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        The axes drawn into.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If arrays differ in length, or no algorithm is given.
-
-    Examples
-    --------
-    >>> import matplotlib.pyplot as plt
-    >>> ax = plot_noise_reduction_against_overdrive([0, 5], {"KF-ANC": [30, 7.5], "KF-OPC": [30, 6.9]}, flip_db=4.2)
-    >>> ax.get_legend_handles_labels()[1]
-    ['KF-ANC', 'KF-OPC', 'Order flips at 4.2 dB']
-    >>> plt.close(ax.figure)
-    """
-    overdrive = as_signal(overdrive_db, "overdrive_db")
-    flips = [] if flip_db is None else [as_number(flip, "flip_db", unit="dB") for flip in np.atleast_1d(flip_db)]
-    if not isinstance(noise_reduction_db, Mapping) or not noise_reduction_db:
-        raise TypeError("noise_reduction_db must map at least one algorithm's name to its noise reduction in dB")
-    levels = {
-        str(name): np.atleast_1d(as_real_array(value, "noise_reduction_db"))
-        for name, value in noise_reduction_db.items()
-    }
-    for name, level in levels.items():
-        if level.shape != overdrive.shape:
-            raise ValueError(f"noise_reduction_db of {name!r} must have {overdrive.size} values, got {level.size}")
-    ax = new_axes(ax)
-    for (name, level), style in zip(levels.items(), named_styles(list(levels), list(levels)), strict=True):
-        ax.plot(overdrive, level, label=name, **{**style, "linewidth": 1.4, "markersize": 5})
-    for flip in flips:
-        ax.axvline(flip, **RATED)
-    if flips:
-        ax.get_lines()[-1].set_label(f"Order flips at {', '.join(f'{flip:.1f}' for flip in flips)} dB")
-    return labelled(ax, xlabel="Overdrive (dB)", ylabel="Noise reduction (dB)")
 
 
 def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> tuple[Path, Path]:

@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_band, as_positive, per_channel
-from ..controllers.base import listed
-from ..loop.result import SimulationResult
-from ..metrics import SOUND_PRESSURE, coherence_and_gain, output_power, power_spectrum_db
+from ..metrics import SOUND_PRESSURE, power_spectrum_db
 from .results import DISTURBANCE, RATED, Results, curves, one_channel, require_common_disturbance, span_of, span_times
-from .style import labelled, legend_above, new_axes
+from .style import labelled, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -230,71 +228,6 @@ def plot_amplifier_output(
     if top > 0:
         ax.set_ylim(-top, top)
     return labelled(ax, ylabel="Amplifier output")
-
-
-def plot_disturbance_and_anti_noise(
-    result: SimulationResult,
-    *,
-    span_s: tuple[float, float],
-    band: tuple[float, float],
-    channel: int | None = None,
-    ax: Axes | None = None,
-) -> Axes:
-    """Draw the disturbance and the anti-noise of one run, and state how linear they are (the paper's Fig. 6 c).
-
-    The title of the legend states the coherence and gain in the band, and the output power, over the second half of the
-    run.
-
-    Parameters
-    ----------
-    result : SimulationResult
-        The run.
-    span_s : (float, float)
-        Start and end in seconds of the waveforms.
-    band : (float, float)
-        Band of the noise in Hz.
-    channel : int, optional
-        Microphone to show, from 0; needed if there are several.
-    ax : matplotlib.axes.Axes, optional
-        Axes to draw into, by default new ones.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        The axes drawn into.
-
-    Raises
-    ------
-    ValueError
-        If the run is too short for the coherence, or there are several runs.
-
-    Examples
-    --------
-    >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import Plant, fx_lms, simulate
-    >>> from kfopc_filterpy.signals import band_limited_noise
-    >>> x = band_limited_noise((200.0, 2000.0), 1.1, fs=16000, rng=0)
-    >>> result = simulate(fx_lms(8, [1.0], step_size=0.01), x, Plant([1.0], [0.5], fs=16000))
-    >>> ax = plot_disturbance_and_anti_noise(result, span_s=(1.0, 1.02), band=(200.0, 2000.0))
-    >>> ax.get_legend().get_title().get_text().splitlines()[0]
-    'Anti-noise over disturbance, 200 to 2000 Hz: coherence 1.0000, gain 1.000'
-    >>> plt.close(ax.figure)
-    """
-    shown = curves(result, single=True)
-    if len(shown) > 1:
-        raise ValueError(f"result must be one run, got {len(shown)}")
-    run = shown[0].run
-    low, high = as_band(band, run.fs)
-    disturbance, anti_noise = one_channel(run.disturbance, channel), one_channel(run.anti_noise, channel)
-    coherence, gain = coherence_and_gain(disturbance, anti_noise, run.fs, (low, high))
-    text = (
-        f"Anti-noise over disturbance, {low:g} to {high:g} Hz: coherence {coherence:.4f}, gain {gain:.3f}\n"
-        f"Output power {listed(output_power(run.control_signal), '.5g')}"
-    )
-    if run.rated_power is not None:
-        text += f", rated power {listed(run.rated_power, 'g')}"
-    named = {f"Anti-noise, {shown[0].label}": run}
-    return legend_above(plot_anti_noise(named, span_s=span_s, channel=channel, ax=ax), text)
 
 
 def _peak(signal: np.ndarray) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import Plant
-from kfopc_filterpy.bounds import budgeted_rated_power
+from kfopc_filterpy.bounds import required_rated_power
 from kfopc_filterpy.bounds.channel_bound import ChannelStretch, channel_record
 from kfopc_filterpy.bounds.power_constrained import weights_within
 from kfopc_filterpy.bounds.wiener import Stretch, full_stretch, loss_db, reduction_db, warn_of_loss
@@ -97,7 +97,7 @@ class FixedFilters:
         """
         if noise_reduction_db <= 0:
             return np.zeros(np.shape(rated_power))[()]
-        found = budgeted_rated_power(
+        found = required_rated_power(
             noise_reduction_db,
             self.x,
             Plant(self.s, fs=self.fs),

@@ -74,16 +74,7 @@ def test_noiseless_identification_is_exact(loudspeakers):
     exact = identify_secondary_path(PLANT, **settings, regularization=0.0)
     assert exact.misalignment_db.shape == (3, 2)
     assert np.all(exact.misalignment_db < -250)
-    assert exact.modelling_error_db.shape == (3, 2, exact.frequencies_hz.size)
-    assert np.all(exact.modelling_error_db < -200)
     np.testing.assert_allclose(identify_secondary_path(PLANT, **settings).misalignment_db, -100, atol=3)
-
-
-def test_a_sweep_identifies_in_turn():
-    settings = {"n_taps": N_TAPS, "duration_s": 0.5, "rng": 0, "excitation": "sweep"}
-    assert np.all(identify_secondary_path(PLANT, **settings, regularization=0.0).misalignment_db < -150)
-    with pytest.raises(ValueError, match="loudspeakers must be 'in turn' for a sweep"):
-        identify_secondary_path(PLANT, **settings, loudspeakers="at once")
 
 
 @pytest.mark.parametrize("loudspeakers", ["in turn", "at once"])

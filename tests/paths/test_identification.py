@@ -9,12 +9,10 @@ import scipy.signal
 from scipy.signal import fftconvolve, lfilter
 
 from kfopc_filterpy import Plant
-from kfopc_filterpy._taps import path_taps
 from kfopc_filterpy.paths.identification import (
     estimate_path,
     identify_secondary_path,
     misalignment_db,
-    modelling_error_db,
 )
 from kfopc_filterpy.paths.models import bandpass_path
 from kfopc_filterpy.paths.uncertainty import path_uncertainty
@@ -54,21 +52,9 @@ def test_30_000_taps_take_no_matrix():
         estimate_path(x, x, n_taps, FS, regularization=0)
 
 
-def test_frequencies_of_the_error_can_be_chosen():
-    result = identify_secondary_path(PLANT, n_taps=16, duration_s=0.2, rng=7, frequencies_hz=[100.0, 1000.0])
-    np.testing.assert_array_equal(result.frequencies_hz, [100.0, 1000.0])
-    omega = 2 * np.pi * np.array([100.0, 1000.0]) / FS
-    true = scipy.signal.freqz(path_taps(PATH), worN=omega)[1]
-    found = scipy.signal.freqz(result.taps, worN=omega)[1]
-    expected = 20 * np.log10(np.abs(found - true) / np.abs(true))
-    np.testing.assert_allclose(result.modelling_error_db, expected, rtol=1e-9)
-
-
 def test_error_measures_have_floors_and_lengths():
     assert misalignment_db([1.0, 2.0], [1.0, 2.0, 0.0]) == pytest.approx(-300)
     assert misalignment_db([3.0, 4.0], [3.0]) == pytest.approx(10 * np.log10(16 / 25))
-    np.testing.assert_array_equal(modelling_error_db(PATH, PATH, [100.0]), [-300.0])
-    np.testing.assert_array_equal(modelling_error_db([1.0, -1.0], [1.0, 1.0], [0.0], fs=FS), [300.0])
     with pytest.raises(ValueError, match="path must not be all zeros"):
         misalignment_db([0.0], [1.0])
 
@@ -76,7 +62,6 @@ def test_error_measures_have_floors_and_lengths():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"excitation": "pink"}, "excitation must be one of 'white', 'sweep'"),
         ({"duration_s": 0.001}, "duration_s must be at least 0.00394 s for 32 taps"),
         ({"level": 0.0}, "level must be greater than 0"),
         ({"plant": Plant(PATH, amplifier=lambda u: math.nan)}, "amplifier must return a finite number, got nan"),
@@ -101,8 +86,7 @@ def test_estimate_refuses(sent, heard, message):
         estimate_path(sent, heard, 4, FS)
 
 
-@pytest.mark.parametrize(("excitation", "peak"), [("white", 20.0), ("sweep", np.sqrt(2) * 2.0)])
-def test_level_is_the_root_mean_square_of_the_excitation(excitation, peak):
+def test_level_is_the_root_mean_square_of_the_excitation():
     sent = []
 
     def record(u):
@@ -110,10 +94,9 @@ def test_level_is_the_root_mean_square_of_the_excitation(excitation, peak):
         return u
 
     plant = Plant(PATH, amplifier=record)
-    identify_secondary_path(plant, n_taps=32, duration_s=2.0, rng=0, excitation=excitation, level=2.0)
-    # 32000 samples: noise within 1 %; a sweep's first, partial period weighs about as much.
+    identify_secondary_path(plant, n_taps=32, duration_s=2.0, rng=0, level=2.0)
+    # 32000 samples: a standard deviation of 0.4 %.
     assert np.sqrt(np.mean(np.square(sent))) == pytest.approx(2.0, rel=0.02)
-    assert np.abs(sent).max() <= peak * (1 + 1e-12)
 
 
 SHORT_PATH = np.concatenate([np.zeros(3), np.random.default_rng(8).standard_normal(29) * np.exp(-np.arange(29) / 8)])

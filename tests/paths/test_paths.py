@@ -76,7 +76,7 @@ def test_taps_of_an_array_are_padded_and_cut():
 def test_taps_of_an_array_need_no_python_control():
     code = (
         "import sys; from kfopc_filterpy._taps import path_taps, sampling_rate;"
-        "from kfopc_filterpy.paths import duct_plant, estimate_path, phase_error;"
+        "from kfopc_filterpy.paths import duct_plant, estimate_path;"
         "from kfopc_filterpy.bounds import wiener_solution;"
         "from kfopc_filterpy.plot import plot_bode;"
         "path_taps([1.0, 0.5], n_taps=2);"
