@@ -6,11 +6,13 @@ import argparse
 import os
 import shlex
 import sys
+import warnings
 from collections.abc import Sequence
 
 from .. import __version__
 from . import demo, export, paths, run, verdict
 from .options import WRONG_INPUT, Parser
+from .printing import warn
 
 PIPE_CLOSED = 141  # as of a program that SIGPIPE ends
 
@@ -45,7 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if unknown:
             raise ValueError(f"unrecognized arguments: {' '.join(unknown)}; see {options.prog} --help")
-        code = options.run(options)
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: warn(options, str(message))
+            code = options.run(options)
         sys.stdout.flush()
         return code
     except BrokenPipeError:  # `head` has read enough; Python would complain at its end of what it cannot write

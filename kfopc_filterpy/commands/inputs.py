@@ -145,7 +145,8 @@ class Files:
     def _chosen(self, path: str, source: str, is_path: bool, fs: float | None) -> Recording:
         """Return the channels of a file, chosen by its argument or else by the options, at a rate."""
         from ..paths.reading import path_of
-        from ..signals.recordings import LEAST_SURE_RATE, as_channel, read_content, recording_of
+        from ..signals.content import LEAST_SURE_RATE
+        from ..signals.recordings import as_channel, read_content, recording_of
 
         named = _named(path)
         content, file_fs = read_content(source, variable=named.variable or self.options.variable), None

@@ -178,7 +178,7 @@ def _described(facts: dict[str, Any]) -> str:
 def convert(options: argparse.Namespace) -> int:
     """Write an impulse response in another format or at another rate."""
     if (options.to is None) == (options.output is None):
-        raise ValueError(f"one file to write is needed, for example {options.path} S.csv or {options.path} -o S.csv")
+        raise ValueError("one file to write is needed, for example S.csv, or -o S.csv")
     output = options.to if options.to is not None else options.output
     _require_output(output)
     files = Files(options)

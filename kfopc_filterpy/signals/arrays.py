@@ -40,6 +40,10 @@ def read_npy(path: str | os.PathLike[str]) -> Content:
 def read_npz(path: str | os.PathLike[str], variable: str | None) -> Content:
     """Return one array of a .npz file."""
     with zipfile.ZipFile(path) as archive:
+        if not any(name.endswith(".npy") for name in archive.namelist()):
+            raise ValueError(
+                f"{path} is an archive without arrays: of a workbook (.xlsx, .ods), save the sheet as .csv"
+            )
         headers: dict[str, _Header] = {}
         for entry in archive.infolist():
             require_room(path, entry.file_size / 8)  # numpy would read a header of any length

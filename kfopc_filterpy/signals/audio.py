@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import shlex
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +12,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from .content import Content, require_room
+from .content import Content, require_room, room_of
 
 # Sizes that a WAV file's header states if its writer could not know it (it wrote to a pipe: ffmpeg, SoX, arecord), or in RF64.
 _SIZES_UNKNOWN = (0xFFFFFFFF, 0x7FFFF000, 0x7FFFFFFF, 0x80000000)
@@ -19,6 +21,7 @@ _LOSSLESS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE"
 _BYTES = {"PCM_16": 2, "PCM_24": 3, "PCM_32": 4}
 _MOST_CHUNKS = 10_000
 _PCM, _EXTENSIBLE = 1, 0xFFFE  # the tags of integers without loss, and of a longer header that has the tag
+_NO_TOTAL = 2**62  # frames, from which a FLAC file states none: its encoder wrote to a pipe
 _TAGS = (b"TAG", b"ID3")  # of music, which some programs append without a chunk
 _CONTAINERS = {b"RIFF": "<", b"RF64": "<", b"BW64": "<", b"RIFX": ">", b"FORM": ">"}  # and their byte order
 
@@ -34,12 +37,10 @@ def read_audio(path: str | os.PathLike[str]) -> Content:
     """Return the samples of an audio file, full scale 1, and its sampling rate."""
     import soundfile
 
-    convert = (
-        f"convert it to WAV, for example with: ffmpeg -i {Path(path).name} -c:a pcm_f32le {Path(path).stem}-pcm.wav"
-    )
+    convert = f"convert it to WAV, for example with: ffmpeg {_from_to(path, '-c:a pcm_f32le')}"
     bits = _require_whole(path)
     try:
-        file = soundfile.SoundFile(path)
+        file = soundfile.SoundFile(_as_rf64(path))
     except soundfile.LibsndfileError as error:
         raise ValueError(
             f"{path} cannot be read as an audio file: {error.error_string} If other programs play it, {convert}"
@@ -50,9 +51,16 @@ def read_audio(path: str | os.PathLike[str]) -> Content:
                 f"{path} is {file.format_info}, {file.subtype_info}, expected WAV, AIFF or FLAC without loss: record it "
                 f"again in one of these, or {convert} (MP3, Ogg, ADPCM and others have left out what an ear would not miss)"
             )
-        # Before anything is read: soundfile makes room for as many frames as the header claims.
-        require_room(path, float(file.frames) * file.channels)
-        frames, claimed, fs = file.read(dtype="float64", always_2d=True), file.frames, file.samplerate
+        claimed, fs = file.frames, file.samplerate
+        if claimed >= _NO_TOTAL:
+            file.seekable = lambda: False  # libsndfile cannot seek in it, which soundfile does after reading
+            claimed, most = 0, room_of(path) // (8 * file.channels)
+            frames = file.read(most, dtype="float64", always_2d=True).copy()
+            require_room(path, frames.size + (len(frames) == most))
+        else:
+            # Before anything is read: soundfile makes room for as many frames as the header claims.
+            require_room(path, float(claimed) * file.channels)
+            frames = file.read(dtype="float64", always_2d=True)
         if bits is not None:
             frames *= _justified(path, frames, bits, _BYTES.get(file.subtype, 0), file.channels)
     if len(frames) == 0:
@@ -63,6 +71,20 @@ def read_audio(path: str | os.PathLike[str]) -> Content:
     if len(frames) < claimed:
         raise ValueError(f"{path} is cut short: its header claims {claimed} frames, {len(frames)} could be read")
     return Content(frames.T, float(fs))
+
+
+def _as_rf64(path: str | os.PathLike[str]) -> str | os.PathLike[str] | io.BytesIO:
+    """Return a file for libsndfile, which does not know that BW64 (ITU-R BS.2088) is RF64 under another name, or RIFF."""
+    with open(path, "rb") as file:
+        if file.read(4) != b"BW64":
+            return path
+        rest = file.read()
+    return io.BytesIO((b"RF64" if rest[8:12] == b"ds64" else b"RIFF") + rest)
+
+
+def _from_to(path: str | os.PathLike[str], coding: str) -> str:
+    """Return the arguments of ffmpeg that write a file beside another."""
+    return f"-i {shlex.quote(Path(path).name)} {coding} {shlex.quote(f'{Path(path).stem}-pcm.wav')}"
 
 
 def _require_whole(path: str | os.PathLike[str]) -> _Bits | None:
@@ -84,7 +106,7 @@ def _require_whole(path: str | os.PathLike[str]) -> _Bits | None:
     if claimed > held:
         raise ValueError(f"{path} is cut short: its header claims {claimed} bytes, {held} are there")
     if more:
-        copy = f"-i {Path(path).name} -c copy {Path(path).stem}-pcm.wav"
+        copy = _from_to(path, "-c copy")
         raise ValueError(
             f"{path} goes on for {more} bytes after the end of its samples that its header states: was the recorder "
             f"interrupted? Read them with ffmpeg -ignore_length 1 {copy}, or leave them out with ffmpeg {copy}"
@@ -143,10 +165,15 @@ def _justified(path: str | os.PathLike[str], frames: np.ndarray, own: _Bits, n_b
     spare = 8 * n_bytes - own.bits
     if own.block == n_channels * n_bytes:
         whole = frames * 2.0 ** (8 * n_bytes - 1)
-        if not np.any(whole % 2**spare):
-            return 1.0
-        if np.max(np.abs(whole)) <= 2.0 ** (own.bits - 1):
-            return float(2**spare)
+        are_high, are_low = not np.any(whole % 2**spare), np.max(np.abs(whole)) <= 2.0 ** (own.bits - 1)
+        if are_high and are_low and np.any(whole):
+            raise ValueError(
+                f"{path} states {own.bits} bits in {8 * n_bytes}, and its samples fit the high as well as the low ones: it is "
+                f"so quiet (-{6 * spare} dB of full scale at most), or of fewer bits in the low ones, as of ALSA's S24_LE; "
+                "record it in 16, 24 (packed) or 32 bits"
+            )
+        if are_high or are_low:
+            return 1.0 if are_high else float(2**spare)
     raise ValueError(
         f"{path} states {own.bits} bits in blocks of {own.block} bytes for {n_channels} channel(s), which its samples "
         "do not fit: record it in 16, 24 (packed) or 32 bits"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,17 +12,28 @@ from typing import NamedTuple
 
 import numpy as np
 
+_SURE_RATE = 1e-4  # share within which the roundest rate is taken without a word
 _LEAST_ROOM = 64 * 2**20  # bytes of float64 samples that any file may hold
+NO_SIGNAL = 100  # rows: no signal rises for so long
+LEAST_SURE_RATE = 300.0  # Hz; kHz that stand for Hz, or ms for s, give less: recorders sample at up to 262 kHz
 _ROUNDED = 0.35  # share by which a step between times may differ: they are written with few digits
 _SAME_RATE = 1e-3  # share by which a rate may differ that is stated twice
+# Rates of converters and analysers in Hz; of those that rounded times allow, one of these is likelier than another.
+_COMMON_RATES = np.array(
+    [8000, 11025, 12000, 12800, 16000, 22050, 24000, 25600, 32000, 44100, 48000, 51200, 64000, 65536, 88200, 96000,
+     102400, 128000, 131072, 176400, 192000, 204800]
+)  # fmt: skip
 _LARGEST_EXPANSION = 100  # bytes of float64 samples for each byte of a larger file
 _STEP_NAMES = ("tinterval", "dt", "ts", "delta_t", "sample_interval", "sampling_interval")  # of a sample interval in s
-_TIME_NAMES = ("t", "time")  # of the times of all samples in s
+_TIME_NAMES = ("t", "time", "tout")  # of the times of all samples in s
 _RATE_NAMES = ("fs", "f_s", "sr", "samplerate", "sample_rate", "samplingrate", "sampling_rate", "sampling_frequency")
 
 
 class Content(NamedTuple):
-    """Samples (..., n_samples) of a file; its sampling rate in Hz, unit and the time of its first sample if it has them."""
+    """Samples (..., n_samples) of a file; its sampling rate in Hz, unit and the time of its first sample if it has them.
+
+    The unit has no prefix; channels in different ones have them in a row: "Pa, V".
+    """
 
     samples: np.ndarray
     fs: float | None = None
@@ -79,16 +91,50 @@ def channels_first(array: np.ndarray) -> np.ndarray:
     return array.reshape(1) if array.ndim == 0 else array
 
 
-def rate_of_step(step_s: float, path: str | os.PathLike[str]) -> float:
-    """Return the sampling rate for a sample interval, which a text rounds: the roundest number of Hz within 1e-4 of it."""
+def rate_of_step(step_s: float, path: str | os.PathLike[str], rounding: float = 0.0) -> float:
+    """Return the sampling rate for a sample interval, which a text rounds: the roundest number of Hz within 1e-4 of it.
+
+    `rounding` is the share by which the interval may be wrong. If that is more, it counts, and a warning says what is taken.
+    Common rates come before round ones.
+    """
     if not (math.isfinite(step_s) and step_s > 0):
         raise ValueError(f"{path} states a sample interval of {step_s:g} s, expected one above 0")
     rate = 1 / step_s
-    for multiple, tolerance in ((1, 1e-9), (100, 1e-4), (25, 1e-4), (1, 1e-4)):
-        whole = multiple * round(rate / multiple)
-        if abs(rate - whole) <= tolerance * rate:
-            return float(whole)
-    return rate
+    if abs(rate - round(rate)) <= 1e-9 * rate:
+        return float(round(rate))
+    share = max(rounding, _SURE_RATE)
+    candidates = [
+        _COMMON_RATES[np.argmin(np.abs(_COMMON_RATES - rate))],
+        *(n * round(rate / n) for n in (1000, 100, 25, 1)),
+    ]
+    taken = next((float(whole) for whole in candidates if abs(rate - whole) <= share * rate), rate)
+    if abs(rate - taken) > _SURE_RATE * rate:
+        warnings.warn(
+            f"{path} has times of few digits, which allow {rate:.0f} Hz +- {rounding * rate:.0f} Hz: it is taken to be sampled "
+            f"at {taken:g} Hz",
+            stacklevel=2,
+        )
+    return taken
+
+
+def agreed_rate(
+    path: str | os.PathLike[str], stated: float | None, timed: float | None, rounding: float = 0.0
+) -> float | None:
+    """Return the rate that a file states, or else that of its times; both must agree as far as the times are known."""
+    if stated and timed and abs(stated - timed) > max(_SAME_RATE, rounding) * stated:
+        raise ValueError(
+            f"{path} states a sampling rate of {stated:g} Hz, but its times give {timed:g} Hz: correct one, or leave it out"
+        )
+    return stated or timed
+
+
+def rounding_of(times: np.ndarray) -> float:
+    """Return the last digit with which times were written, at most: 1e-5 for 0.00002 and 0.00005; 0 if they have many."""
+    for digits in range(10):
+        scaled = times * 10.0**digits
+        if np.all(np.abs(scaled - np.round(scaled)) < 1e-6):
+            return 10.0**-digits
+    return 0.0
 
 
 def even_step(times: np.ndarray) -> float | None:
@@ -96,6 +142,8 @@ def even_step(times: np.ndarray) -> float | None:
     steps, step = np.diff(times), (times[-1] - times[0]) / (len(times) - 1)
     drift = np.max(np.abs(times - times[0] - step * np.arange(len(times))))
     even = np.all(steps > 0) and np.max(np.abs(steps - step)) <= _ROUNDED * step and drift <= step
+    if len(times) >= NO_SIGNAL and step > 0:
+        even = even or drift <= min(rounding_of(times), step)  # each is rounded, and no more than that
     return float(step) if even else None
 
 
@@ -129,10 +177,10 @@ def _rate_and_start(
 ) -> tuple[float | None, float]:
     """Return the sampling rate in Hz, if one is stored beside a variable, and the time of the first sample in s.
 
-    The fields of the variable's own struct come before variables outside.
+    The fields of the variable's own struct come before those of the structs around it, and variables outside.
     """
-    folder = name.rpartition(".")[0]
-    for inside in dict.fromkeys((folder, "")):
+    folders = name.split(".")[:-1]
+    for inside in [".".join(folders[:n]) for n in range(len(folders), -1, -1)]:  # Simulink: a.signals.values, a.time
         numbers: dict[str, list[float]] = {}
         times: list[np.ndarray] = []
         for key, shape in shapes.items():
@@ -148,7 +196,7 @@ def _rate_and_start(
             step = even_step(one)
             if step is None:
                 raise ValueError(f"{path} has times in uneven steps: export it with a constant sampling rate")
-            rates.append(rate_of_step(step, path))
+            rates.append(rate_of_step(step, path, rounding_of(one) / np.ptp(one)))
             starts.append(float(one[0]))
         if rates and max(rates) > (1 + _SAME_RATE) * min(rates):
             raise ValueError(

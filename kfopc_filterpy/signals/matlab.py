@@ -31,7 +31,8 @@ def read_mat_here(path: str | os.PathLike[str], variable: str | None) -> Content
     for name in [name for name, kind in others.items() if kind == "struct" and variable not in shapes]:
         fields |= _fields(name, loadmat(path, variable_names=[name])[name])
     shapes |= {name: field.shape for name, field in fields.items() if field.dtype.kind in "fiub"}
-    others |= {name: str(field.dtype) for name, field in fields.items() if name not in shapes}
+    kinds = {"O": "a cell or struct array: store its parts in variables of their own", "U": "text"}
+    others |= {n: kinds.get(one.dtype.kind, str(one.dtype)) for n, one in fields.items() if n not in shapes}
 
     def read(name: str) -> np.ndarray:
         return fields[name] if name in fields else loadmat(path, variable_names=[name])[name]

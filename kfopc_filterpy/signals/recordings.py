@@ -25,17 +25,26 @@ from .._validate import (
 from .._writing import replacing
 from .arrays import read_npy, read_npz
 from .audio import read_audio
-from .content import Content, channels_first, reading, require_file, require_room
+from .content import (
+    LEAST_SURE_RATE,
+    Content,
+    agreed_rate,
+    channels_first,
+    even_step,
+    reading,
+    require_file,
+    require_room,
+    rounding_of,
+)
 from .hdf5 import read_sofa
 from .matlab import read_mat
-from .text import read_text
+from .text import Table, read_text, without_time
 from .uff import read_uff
 
 _REFERENCE_PRESSURE = 20e-6  # Pa, of sound pressure levels
 _LEAST_TONE_S = 0.5  # of a calibrator
 _LEAST_TONE_SHARE = 0.9  # of the power of a calibrator's recording
 _LARGEST_DRIFT_DB = 0.5
-LEAST_SURE_RATE = 300.0  # Hz; kHz that stand for Hz, or ms for s, give less: recorders sample at up to 262 kHz
 
 
 class _Format(NamedTuple):
@@ -46,6 +55,7 @@ class _Format(NamedTuple):
     suffixes: tuple[str, ...]
     beginnings: tuple[bytes, ...] = ()  # first bytes, by which a file without a known suffix is recognised
     has_variables: bool = False
+    holds_arrays: bool = False  # whose axes, and times among them, nothing names
 
 
 _AUDIO_FILES = (".wav", ".wave", ".bwf", ".rf64", ".flac", ".aif", ".aiff", ".aifc")
@@ -65,12 +75,12 @@ _AUDIO_HEADS = (
     b".snd",
 )
 _AUDIO = _Format("an audio file", read_audio, _AUDIO_FILES + _REFUSED_AUDIO, _AUDIO_HEADS)
-_MAT = _Format("a MAT file", read_mat, (".mat",), (b"MATLAB",), has_variables=True)
+_MAT = _Format("a MAT file", read_mat, (".mat",), (b"MATLAB",), has_variables=True, holds_arrays=True)
 _UFF = _Format("a UFF file", read_uff, (".uff", ".unv", ".uf", ".58"))
 _SOFA = _Format("a SOFA file", read_sofa, (".sofa",), (b"\x89HDF",))
 _TEXT = _Format("text", read_text, (".txt", ".csv", ".tsv", ".dat", ".asc", ".lvm", ".frd", ".zma"))
-_NPY = _Format("a .npy file", read_npy, (".npy",), (b"\x93NUMPY",))
-_NPZ = _Format("a .npz file", read_npz, (".npz",), (b"PK\x03\x04",), has_variables=True)
+_NPY = _Format("a .npy file", read_npy, (".npy",), (b"\x93NUMPY",), holds_arrays=True)
+_NPZ = _Format("a .npz file", read_npz, (".npz",), (b"PK\x03\x04",), has_variables=True, holds_arrays=True)
 _FORMATS = (_AUDIO, _MAT, _UFF, _SOFA, _TEXT, _NPY, _NPZ)
 
 
@@ -192,7 +202,7 @@ def read_recording(
     variable : str, optional
         Variable of a .mat or .npz file, or field of a struct: "meas.ir". By default the only one with several values.
     unit : str, optional
-        Unit of the samples, after scaling. By default what the file states, or "1".
+        Unit of the samples, after scaling. By default what the file states, without a prefix (Pa for mPa), or "1".
     unit_per_full_scale : float, optional
         What the number 1 in the file stands for, in `unit`: 2.5 for a WAV file whose full scale is 2.5 Pa, or 20 for
         numbers in volts of a microphone with 50 mV/Pa.
@@ -219,7 +229,7 @@ def read_recording(
         If the file is empty, cut short, damaged, claims more than it has, or holds NaN or Inf; if it holds several variables
         and none is chosen, or no such variable or channel; if no sampling rate is known, or `file_fs` is another than
         the file's; if the file states a rate below 300 Hz and neither `fs` nor `file_fs` confirms it; if the rates are in
-        no ratio of whole numbers; if a scale comes without its unit.
+        no ratio of whole numbers; if a scale comes without its unit; if `unit` is another than the file's.
 
     See Also
     --------
@@ -354,11 +364,29 @@ def read_content(path: str | os.PathLike[str], *, channel: int | None = None, va
             "which axis is which? Store it in that order; (taps, microphones, loudspeakers) becomes it with MATLAB's "
             "permute(S, [2 3 1]) or numpy.moveaxis(S, 0, 2)"
         )
+    if kind.holds_arrays:
+        content = _without_time(path, content)
     samples = channels_first(content.samples)
     if channel is not None:
         samples = np.atleast_2d(samples)[as_channel(channel, np.atleast_2d(samples), path)]
     require_finite(samples, f"the signal of {path}")
     return content._replace(samples=np.ascontiguousarray(samples, dtype=np.float64))
+
+
+def _without_time(path: str | os.PathLike[str], content: Content) -> Content:
+    """Return an array's channels without the times beside them, by the rules for the columns of a text."""
+    samples = content.samples
+    if samples.ndim == 2 and samples.shape[0] == samples.shape[1] > 1:
+        raise ValueError(
+            f"{path} has the shape {samples.shape}: which axis is time? Store more samples than channels, or each channel "
+            "in a variable or file of its own"
+        )
+    channels = np.asarray(channels_first(samples), dtype=float)
+    if channels.ndim != 2 or even_step(channels[0]) is None:
+        return content
+    times, timed = channels[0], without_time(path, Table([], channels.T, []))
+    fs = agreed_rate(path, content.fs, timed.fs, rounding_of(times) / np.ptp(times))
+    return content._replace(samples=timed.samples, fs=fs, start_s=content.start_s or timed.start_s)
 
 
 def as_channel(channel: int, samples: np.ndarray, name: object, *, called: str = "channel") -> int:
@@ -414,8 +442,18 @@ def rates_of(
 
 def scaled(content: Content, unit: str | None, unit_per_full_scale: float | None) -> tuple[np.ndarray, str]:
     """Return the samples in their unit."""
+    stated = content.unit if content.unit not in (None, "1") else None
+    if unit is not None and stated is not None and (unit_per_full_scale is None) == (unit != stated):
+        raise ValueError(
+            f"the file states that it is in {stated}, but unit = {unit!r}"
+            + (
+                f": leave out unit_per_full_scale, its numbers are in {stated} already"
+                if unit == stated
+                else f": leave out unit, choose a channel, or give unit_per_full_scale, the {unit} that 1 {stated} stands for"
+            )
+        )
     if unit_per_full_scale is None:
-        return content.samples, unit or content.unit or "1"
+        return content.samples, unit or stated or "1"
     if unit is None:
         raise ValueError('unit_per_full_scale needs the unit of its result: pass unit="Pa" or unit="V", for example')
     return content.samples * as_positive(unit_per_full_scale, "unit_per_full_scale"), unit

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .content import Content, even_step, rate_of_step
+from .content import LEAST_SURE_RATE, NO_SIGNAL, Content, agreed_rate, even_step, rate_of_step, rounding_of
 
 _LONGEST_HEADER = 100  # lines
 _TEKTRONIX = re.compile(
@@ -19,12 +19,20 @@ _TEKTRONIX = re.compile(
 _CLOCK = re.compile(r"\d:\d\d:\d\d")
 _REW = "* Impulse Response data saved by REW"
 _LABVIEW, _END_OF_HEADER = "LabVIEW Measurement", "***End_of_Header***"
-_NO_SIGNAL = 100  # rows: no signal rises for so long
 _LEAST_RISES = 10  # of a column that is no signal, between values that repeat
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _SECONDS = {"s": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}  # by the first letter of the unit
 # The first column's name, if any, and its unit: "Time (ms)", "t/s", "(µs)"; "\ufffd" is µ in another encoding.
 _TIME_UNIT = re.compile(r"\W*?(?:\w+?[\s(\[/_]+)?(seconds?|sec|s|ms|msec|[uµμ\ufffd]s|usec|ns)(?!\w)")
+# What a header says of rate and units: "Sample Rate: 48000 Hz", "fs [kHz];51,2", "Sample interval = 20 us"; "P (mPa)".
+_AFTER = r"\b[^\w.+-]*(?:([kmu\u00b5\u03bcn]?)(hz|s)\b[^\w.+-]*)?(\d[\d.,]*(?:e[-+]?\d+)?)(?:\s*,?\s*([kmu\u00b5\u03bcn]?)(hz|s)\b)?"
+_STATED = {
+    "hz": re.compile(r"\b(?:sampl\w*[ _-]*(?:rate|freq\w*)|(f_?s|sr))" + _AFTER, re.IGNORECASE),
+    "s": re.compile(r"\b(?:sampl\w*[ _-]*(?:interval|period)|(dt))" + _AFTER, re.IGNORECASE),
+}
+_UNIT = re.compile(r"(?:[(\[/]\s*|^\W*)([muk\u00b5\u03bc]?)(Pa|V|Volts?|A|N|g|m/s(?:\u00b2|\^?2)?)\s*[)\]]?\W*$")
+_PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "\u00b5": 1e-6, "\u03bc": 1e-6, "n": 1e-9}
+_FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")  # 1.0D-03
 _FIRST_NAME = re.compile(r"[^,;\t]*[,;\t]|\S+\s+")  # of a heading
 _FREQUENCY = re.compile(r"\W*(freq|hz\b|f\s*[(\[/]\s*hz)", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d)")
@@ -33,25 +41,29 @@ _QUOTED = re.compile(r'"\s*([^"]*)"')
 
 
 class Table(NamedTuple):
-    """Columns of numbers, (n_rows, n_columns), and the lines above them that are not blank."""
+    """Columns of numbers, (n_rows, n_columns), the lines above them that are not blank, and the columns' headings if any."""
 
     header: list[str]
     columns: np.ndarray
+    names: list[str]
 
 
 class _Layout(NamedTuple):
-    """Which line is the first with numbers, what separates them, and whether decimals follow a comma."""
+    """Which line is the first with numbers, what separates them, whether decimals follow a comma, and the first column is empty."""
 
     first: int
     delimiter: str | None
     has_decimal_comma: bool
+    has_empty_column: bool
 
     def plain(self, line: str) -> str:
-        """Return a line without quotes, decimal commas and a separator at its end; a comma within quotes is decimal."""
+        """Return a line without quotes, decimal commas and separators around it; a comma within quotes is decimal."""
         if '"' in line:
             line = _QUOTED.sub(lambda quoted: _DECIMAL_COMMA.sub(".", quoted[1]), line)
         line = line.rstrip()
         line = _DECIMAL_COMMA.sub(".", line) if self.has_decimal_comma else line
+        line = _FORTRAN.sub("e", line)
+        line = line.lstrip(self.delimiter) if self.has_empty_column else line
         return line.rstrip(self.delimiter) if self.delimiter else line
 
 
@@ -62,7 +74,31 @@ def read_text(path: str | os.PathLike[str]) -> Content:
         return _read_rew(path, head)
     if head and head[0].startswith(_LABVIEW):
         return _read_labview(path, head)
-    return _without_time(path, read_table(path))
+    table = read_table(path)
+    content = without_time(path, table)
+    rounding = rounding_of(table.columns[:, 0]) / (np.ptp(table.columns[:, 0]) or 1.0)
+    return content._replace(fs=agreed_rate(path, _stated_rate(path, table.header), content.fs, rounding))
+
+
+def _stated_rate(path: str | os.PathLike[str], header: list[str]) -> float | None:
+    """Return the rate in Hz that a header names, None if it names none."""
+    for kind, stated in _STATED.items():
+        for found in filter(None, map(stated.search, header)):
+            short, before, unit_before, number, after, unit_after = found.groups()
+            plain = number.replace(",", "" if re.fullmatch(r"\d+(,\d{3})+", number) else ".").rstrip(".")
+            value = float(plain) * _PREFIXES[(before or after or "").lower()]
+            unit = (unit_before or unit_after or kind).lower()
+            if unit == kind and not (short and kind == "hz" and value < LEAST_SURE_RATE):  # "FS: 10 V" is full scale
+                return value if kind == "hz" else rate_of_step(value, path)
+    return None
+
+
+def _units(names: list[str]) -> tuple[np.ndarray, str | None]:
+    """Return the factors of columns to units without prefix, and the units, by the columns' headings."""
+    found = [_UNIT.search(name) for name in names]
+    factors = np.array([_PREFIXES[one[1]] if one else 1.0 for one in found] or [1.0])
+    units = [re.sub("^Volts?$", "V", one[2]) if one else "1" for one in found]
+    return factors, ", ".join(units[: 1 if len(set(units)) == 1 else None]) if any(found) else None
 
 
 def read_table(path: str | os.PathLike[str], *, n_least: int = 1) -> Table:
@@ -71,8 +107,8 @@ def read_table(path: str | os.PathLike[str], *, n_least: int = 1) -> Table:
     layout = _layout(path, head)
     header = [line for line in head[: layout.first] if line.strip()]
     if n_least == 1 and layout.delimiter == "," and _ONE_COMMA.fullmatch(layout.plain(head[layout.first]).strip()):
-        names = header[-1].strip() if header else ""
-        if _is_decimal(path, names, islice(_lines(path), layout.first, None)):
+        heading = header[-1].strip() if header else ""
+        if _is_decimal(path, heading, islice(_lines(path), layout.first, None)):
             layout = layout._replace(delimiter=None, has_decimal_comma=True)
     # A "#" begins a comment at the start of a line only: "1.#INF" is no 1.
     rows = (layout.plain(line) for line in islice(_lines(path), layout.first, None) if not line.startswith("#"))
@@ -88,7 +124,8 @@ def read_table(path: str | os.PathLike[str], *, n_least: int = 1) -> Table:
         raise _ambiguous(path)
     if columns.shape[1] < n_least:
         raise ValueError(f"{path} must hold {n_least} columns, got {columns.shape[1]}")
-    return Table(header, columns)
+    names = layout.plain(header[-1]).split(layout.delimiter) if header and columns.shape[1] > 1 else header[-1:]
+    return Table(header, columns, names if len(names) == columns.shape[1] else [])
 
 
 def _lines(path: str | os.PathLike[str]) -> Iterator[str]:
@@ -107,7 +144,8 @@ def _layout(path: str | os.PathLike[str], head: list[str]) -> _Layout:
         raise ValueError(f"{path} is neither text nor of a kind that is read: export it as WAV, text, .mat or .npy")
     for first, line in enumerate(head):
         for delimiter in (";", "\t", ",", None):
-            layout = _Layout(first, delimiter, delimiter != ",")
+            is_empty = delimiter is not None and all(one.startswith(delimiter) for one in head[first : first + 2])
+            layout = _Layout(first, delimiter, delimiter != ",", is_empty)
             if (delimiter is None or delimiter in line) and _are_numbers(layout.plain(line), delimiter):
                 return layout
     shown = next((line.strip() for line in head if line.strip()), "")[:60]
@@ -158,45 +196,48 @@ def _ambiguous(path: str | os.PathLike[str]) -> ValueError:
     )
 
 
-def _without_time(path: str | os.PathLike[str], table: Table) -> Content:
+def without_time(path: str | os.PathLike[str], table: Table) -> Content:
     """Return the channels (rows are samples); leave out a column that counts samples or time, which gives the rate."""
-    header, columns = table
+    header, columns, names = table
+    factors, unit = _units(names)
     if columns.shape[1] < 2:
-        return Content(columns)
+        return Content(columns * factors, None, unit)
     if any(map(_FREQUENCY.match, header[-1:])) or any("frequency step" in line.lower() for line in header):
         raise ValueError(
             f"{path} is a frequency response, its first column is a frequency in Hz ({header[-1].strip()!r}): export the "
             "impulse response (or the recording) instead"
         )
     times, steps = columns[:, 0], np.diff(columns[:, 0])
-    without_first = Table([_FIRST_NAME.sub("", line, count=1) for line in header], columns[:, 1:])
+    without_first = Table([_FIRST_NAME.sub("", line, count=1) for line in header], columns[:, 1:], names[1:])
     if header and header[-1].startswith((",", ";", "\t")) and np.all(steps == 1):  # an index, which has no name
-        return _without_time(path, without_first)
+        return without_time(path, without_first)
     repeats = np.any(steps == 0) and np.sum(steps) >= _LEAST_RISES * np.max(steps)  # times with few digits
     if len(times) < 3 or not (np.all(steps > 0) or (np.all(steps >= 0) and repeats)):
-        return Content(columns)
+        return Content(columns * factors, None, unit)
     step = even_step(times)
     if step is None:
-        if len(times) >= _NO_SIGNAL:
+        if len(times) >= NO_SIGNAL:
             raise ValueError(
                 f"{path} has a first column that rises in uneven steps, from {steps.min():g} to {steps.max():g}: export it "
                 "with a constant sampling rate and all digits of the times, or without the times"
             )
-        return Content(columns)
+        return Content(columns * factors, None, unit)
     units = [found[1] for found in map(_TIME_UNIT.match, reversed(header)) if found]
     if step == 1 and not units:  # the number of each sample
         named = dict(zip(*(line.strip().split(",") for line in header[-2:]), strict=False)) if len(header) > 1 else {}
         if {"Start", "Increment"} <= named.keys():  # an oscilloscope of Rigol
             step_s, start_s = float(named["Increment"]), float(named["Start"])
             return Content(columns[:, 1:], rate_of_step(step_s, path), start_s=start_s)
-        return _without_time(path, without_first)
+        return without_time(path, without_first)
     if step > 1 and not units:
         raise ValueError(
             f"{path} has a first column that rises in steps of {step:g} without a unit: are they times? Name their unit "
             'in the line above the numbers, as in "Time (ms)", or leave out the column'
         )
     unit_s = _SECONDS.get(units[0][0], 1e-6) if units else 1.0
-    return Content(columns[:, 1:], rate_of_step(step * unit_s, path), start_s=float(times[0] * unit_s))
+    factors, unit = _units(names[1:])
+    fs = rate_of_step(step * unit_s, path, rounding_of(times) / np.ptp(times))
+    return Content(columns[:, 1:] * factors, fs, unit, float(times[0] * unit_s))
 
 
 def _read_labview(path: str | os.PathLike[str], head: list[str]) -> Content:
@@ -222,7 +263,8 @@ def _read_labview(path: str | os.PathLike[str], head: list[str]) -> Content:
     lines = map(plain, islice(_lines(path), ends[1] + 2, None))
     columns = np.loadtxt(lines, delimiter=delimiter, usecols=channels, comments=None, ndmin=2)
     fs = rate_of_step(steps.pop(), path) if steps else None
-    return Content(columns, fs, start_s=starts.pop() if starts else 0.0)
+    factors, unit = _units([f"({one})" for one in values.get("Y_Unit_Label", [])][: len(channels)])
+    return Content(columns * factors, fs, unit, starts.pop() if starts else 0.0)
 
 
 def _read_rew(path: str | os.PathLike[str], head: list[str]) -> Content:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zipfile
 
 import numpy as np
 import pytest
@@ -385,6 +386,107 @@ def test_a_matrix_of_paths_whose_taps_are_not_last_is_asked_for_its_axes(tmp_pat
     scipy.io.savemat(path, {"S": taps}) if suffix == "mat" else np.save(path, taps)
     with pytest.raises(ValueError, match=rf"\({shape[0]}, {shape[1]}, 4\).*microphones, loudspeakers, taps"):
         read_path(path, fs=FS)
+
+
+# ---- what a file states
+
+
+def times(form, fs, n=400, unit_s=1.0):
+    return "".join(f"{n / fs / unit_s:{form}},{300 + n % 7}\n" for n in range(n))
+
+
+def a_simulink_structure(path):
+    """Write what Simulink's To Workspace logs as "Structure With Time"."""
+    one = np.empty((1, 1), [(name, object) for name in ("values", "dimensions", "label")])
+    one[0, 0] = (SIGNAL, 1.0, "p")
+    whole = np.empty((1, 1), [(name, object) for name in ("time", "signals", "blockName")])
+    whole[0, 0] = (TIMES, one, "fan/To Workspace")
+    scipy.io.savemat(path, {"simout": whole})
+
+
+def a_flac_from_a_pipe(path):
+    soundfile.write(path, signal(), FS)
+    content = bytearray(path.read_bytes())
+    content[21] &= 0xF0  # the 36 bits of the number of samples in STREAMINFO
+    content[22:26] = bytes(4)
+    path.write_bytes(content)
+
+
+def a_bw64(path):
+    soundfile.write(path, signal(), FS, format="RF64", subtype="PCM_16")
+    path.write_bytes(b"BW64" + path.read_bytes()[4:])
+
+
+def a_short_bw64(path):
+    path.write_bytes(b"BW64" + wav(np.int16(2**15 * signal()), 16, 2)[4:])
+
+
+def a_workbook(path):
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("[Content_Types].xml", "<Types/>")
+        file.writestr("xl/workbook.xml", "<workbook/>")
+
+
+def quiet_or_16_bits_in_the_low_24(path):
+    path.write_bytes(wav(np.resize(np.int32(2**15 * signal()) * 256, FS).view(np.uint8), 24, 4))
+
+
+# A file's name; its text, or what writes it; how it is asked for; its rate, unit and first samples, or the error.
+STATED = [
+    ("rate.txt", "Sample Rate: 48000 Hz. Linear scale\n0.5\n1\n", {"fs": 48000}, (48000, "1", [0.5, 1])),
+    ("khz.csv", "fs [kHz];51,2\np [kPa]\n0,5\n1,0\n", {}, (51200, "Pa", [500, 1000])),
+    ("thousands.txt", "Sampling frequency = 48,000 Hz\n0.5\n1\n", {}, (48000, "1", [0.5, 1])),
+    ("step.txt", "sample interval: 20 us\n0.5\n1\n", {}, (50000, "1", [0.5, 1])),
+    ("scale.txt", "FS: 10 V\n0.5\n1\n", {"fs": 8000}, (8000, "1", [0.5, 1])),
+    ("two.csv", "Sample Rate,8000\nt,p\n" + times(".6f", 16000), {}, "states a sampling rate of 8000 Hz, but its times give 16000"),
+    ("one.csv", "Sample Rate,16000\nt,p\n" + times(".6f", 16000), {}, (16000, "1", [300, 301])),
+    ("given.txt", "Sample Rate: 48000 Hz\n0.5\n1\n", {"file_fs": 16000}, "a sampling rate of 48000 Hz, but file_fs = 16000"),
+    ("mpa.csv", "t (s),P (mPa)\n" + times(".7f", 16000), {"unit": "Pa"}, (16000, "Pa", [0.3, 0.301])),
+    ("own.csv", "t (s),P (mPa)\n" + times(".7f", 16000), {}, (16000, "Pa", [0.3, 0.301])),
+    ("volt.csv", "Time,A\n(ms),(mV)\n" + times(".4f", 16000, unit_s=1e-3), {"unit": "Pa", "unit_per_full_scale": 20}, (16000, "Pa", [6, 6.02])),
+    ("other.csv", "t (s),u [V]\n" + times(".7f", 16000), {"unit": "Pa"}, "is in V, but unit = 'Pa': .* unit_per_full_scale"),
+    ("twice.csv", "t (s),P (Pa)\n" + times(".7f", 16000), {"unit": "Pa", "unit_per_full_scale": 2}, "is in Pa, .* already"),
+    ("both.csv", "P (Pa);u (V)\n1,5;2\n2,5;3\n0;1\n", {"fs": 8000}, (8000, "Pa, V", [[1.5, 2.5, 0], [2, 3, 1]])),
+    ("few.csv", "t,p\n" + times(".5f", 44100), {}, (44100, "1", [300, 301])),
+    ("fewer.csv", "t,p\n" + times(".5f", 48000), {}, (48000, "1", [300, 301])),
+    ("odd.csv", "t,p\n" + times(".5f", 44000), {}, (44000, "1", [300, 301])),
+    ("empty.csv", ",0.1,0.5\n,0.2,1\n,0.0,7\n", {"fs": 8000}, (8000, "1", [[0.1, 0.2, 0], [0.5, 1, 7]])),
+    ("fortran.txt", " 1.0D-03\n -2.D+00\n", {"fs": 8000}, (8000, "1", [0.001, -2])),
+    ("rows.txt", "1 2 3\n4 5 6\n7 8\n", {"fs": 8000}, "number of columns changed from 3 to 2 at row 3"),
+    ("square.npy", lambda path: np.save(path, np.eye(4)), {"fs": 8000}, r"\(4, 4\): which axis is time"),
+    ("t.npy", lambda path: np.save(path, np.c_[TIMES, SIGNAL]), {}, (FS, "1", signal()[:2])),
+    ("t.mat", lambda path: scipy.io.savemat(path, {"to_file": np.c_[TIMES, SIGNAL].T}), {}, (FS, "1", signal()[:2])),
+    ("t8.mat", lambda path: scipy.io.savemat(path, {"a": np.c_[TIMES, SIGNAL], "fs": 8e3}), {}, "8000 Hz, but its times give 16000"),
+    ("simulink.mat", a_simulink_structure, {}, (FS, "1", signal()[:2])),
+    ("ragged.mat", lambda path: scipy.io.savemat(path, {"m": {"ir": [np.ones(3), np.ones(4)]}}), {}, r"m\.ir \(a cell or struct array: store"),
+    ("pipe.flac", a_flac_from_a_pipe, {}, (FS, "1", signal()[:2])),
+    ("bw64.wav", a_bw64, {}, (FS, "1", signal()[:2])),
+    ("short.wav", a_short_bw64, {}, (FS, "1", signal()[:2])),
+    ("sheet.xlsx", a_workbook, {}, r"an archive without arrays: .* save the sheet as \.csv"),
+    ("s24.wav", quiet_or_16_bits_in_the_low_24, {}, r"fit the high as well as the low .*S24_LE; record it"),
+    ("a fan.ogg", lambda path: soundfile.write(path, signal(), FS), {}, "ffmpeg -i 'a fan.ogg' -c:a pcm_f32le 'a fan-pcm.wav'"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "content", "asked", "expected"), STATED, ids=[one[0] for one in STATED])
+@pytest.mark.filterwarnings("ignore:.*times of few digits")
+def test_what_a_file_states_is_read_or_asked_about(tmp_path, name, content, asked, expected):
+    path = tmp_path / name
+    path.write_text(content, encoding="utf-8") if isinstance(content, str) else content(path)
+    if isinstance(expected, str):
+        with pytest.raises(ValueError, match=expected):
+            read_recording(path, **asked)
+        return
+    recording = read_recording(path, **asked)
+    assert (recording.fs, recording.unit) == expected[:2]
+    n = np.shape(expected[2])[-1]
+    np.testing.assert_allclose(recording.samples[..., :n], expected[2], rtol=1e-14)
+
+
+def test_a_rate_by_times_of_few_digits_is_said(tmp_path):
+    (tmp_path / "x.csv").write_text("t,p\n" + times(".5f", 44100))
+    with pytest.warns(UserWarning, match=r"which allow 44088 Hz \+- 49 Hz: it is taken to be sampled at 44100 Hz"):
+        read_recording(tmp_path / "x.csv")
 
 
 # ---- UFF
