@@ -45,7 +45,7 @@ mathjax3_config = {"options": {"enableMenu": False}}  # the menu's settings load
 # .ci/run sets this variable: the tests run the tutorials, too.
 nb_execution_excludepatterns = ["tutorials/*"] if os.environ.get("DOCS_WITHOUT_TUTORIALS") else []
 nb_execution_mode = "force"
-nb_execution_timeout = 300
+nb_execution_timeout = -1  # none: how long a tutorial takes is up to the machine
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 nb_output_stderr = "warn"  # a warning in a cell is an error of the page

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-import threading
-import time
 from copy import deepcopy
 from typing import Any
 
@@ -15,9 +12,8 @@ from helpers.controllers import ALL
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy import LimitedController, OutputLimiter, Plant, fx_lms, fx_nlms, fx_rls, simulate
+from kfopc_filterpy import Plant, fx_nlms, fx_rls, simulate
 from kfopc_filterpy.checkpoint import content_of
-from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.signals import band_limited_noise, tone
 
 LOUD = [-1e160, 1e308]
@@ -138,72 +134,3 @@ def test_defaults_scale_with_the_signal(name: str, scale: float) -> None:
     x = scale * NOISES["white"](6 * FS)
     result = simulate(MAKERS[name](), x, Plant(S, P, fs=FS))
     assert np.mean(result.error[-FS // 2 :] ** 2) < 1e-3 * np.mean(result.disturbance[-FS // 2 :] ** 2)
-
-
-# Threads.
-
-
-def test_a_second_thread_is_refused_and_the_first_one_is_unharmed() -> None:
-    x, e = np.random.default_rng(0).standard_normal((2, 3_000_000))
-    controller, alone = (fx_lms(64, S, step_size=1e-6) for _ in range(2))
-    expected, answers = alone.process(x, e), []
-    calls = [
-        lambda: controller.process(x[:10], e[:10]),
-        lambda: controller.control_signal(1.0),
-        lambda: controller.update(1.0),
-        lambda: controller.listen(x[:10], e[:10]),
-        lambda: setattr(controller, "secondary", S),
-        lambda: setattr(controller, "limiter", OutputLimiter(1.0, fs=16000)),
-        lambda: pickle.dumps(controller),
-        lambda: simulate(controller, x[:10], Plant(S, fs=FS), disturbance=e[:10]),
-    ]
-    running = threading.Thread(target=lambda: answers.append(controller.process(x, e)))
-    running.start()
-    time.sleep(0.02)  # until it is in compiled code, where it stays for half a second
-    for call in calls:
-        with pytest.raises(RuntimeError, match="in use by another thread"):
-            call()
-    assert running.is_alive()  # it ran meanwhile
-    running.join()
-    np.testing.assert_array_equal(answers[0], expected)
-    assert content_of(controller) == content_of(alone)
-
-
-class Patient:
-    """A user's own controller, which stays in a step until it is told to go on."""
-
-    def __init__(self) -> None:
-        self.started, self.may_go_on = threading.Event(), threading.Event()
-
-    def control_signal(self, reference: float) -> float:
-        self.started.set()
-        self.may_go_on.wait(10)
-        return float(reference)
-
-    def update(self, error: float) -> None: ...
-
-
-@pytest.mark.parametrize(
-    "wrap",
-    [
-        lambda own: LimitedController(own, OutputLimiter(4.0, fs=FS)),
-        lambda own: FeedbackNeutralizer(own, [0.0, 0.1]),
-    ],
-)
-def test_a_second_thread_is_refused_by_a_wrapper_of_ones_own_controller(wrap: Any) -> None:
-    own, answers = Patient(), []
-    controller = wrap(own)
-    running = threading.Thread(target=lambda: answers.append(controller.control_signal(1.0)))
-    running.start()
-    own.started.wait(10)
-    for call in (
-        lambda: controller.control_signal(2.0),
-        lambda: controller.update(1.0),
-        lambda: controller.process([2.0], [1.0]),
-        lambda: simulate(controller, [2.0], Plant(S, fs=FS), disturbance=[1.0]),
-    ):
-        with pytest.raises(RuntimeError, match="in use by another thread"):
-            call()
-    own.may_go_on.set()
-    running.join()
-    assert answers == [1.0]

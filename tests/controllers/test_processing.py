@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import gc
-import threading
-import time
 import tracemalloc
 from copy import deepcopy
 from typing import Any
@@ -17,7 +15,7 @@ from helpers.controllers import ALL
 from helpers.loop import S_HAT
 from helpers.simulation import X
 
-from kfopc_filterpy import KFOPC, KalmanController, frequency_domain_fx_lms, fx_lms, kf_anc
+from kfopc_filterpy import KFOPC, KalmanController, frequency_domain_fx_lms, fx_lms
 from kfopc_filterpy.checkpoint import content_of
 from kfopc_filterpy.controllers import CoreController, RefusedUpdate
 
@@ -146,20 +144,6 @@ def test_memory_is_not_allocated_after_the_first_block(name: str) -> None:
         tracemalloc.stop()
     assert after - before < 5000  # in all 20 blocks, each of which has 8000 bytes in each signal
     assert peak - before < 8000  # less than one of the signals of the block
-
-
-def test_the_interpreter_lock_is_released() -> None:
-    """While a thread processes a block of half a second or so, this one counts."""
-    controller = kf_anc(256, S_HAT, state_noise=1e-9, measurement_noise=1.0)
-    controller.process(X[:10], X[:10])
-    x = np.random.default_rng(0).standard_normal(40_000)
-    thread = threading.Thread(target=controller.process, args=(x, x))
-    thread.start()
-    ticks = 0
-    while thread.is_alive():
-        time.sleep(0.005)
-        ticks += 1
-    assert ticks > 20  # with the lock held, only the last one or two
 
 
 @pytest.mark.parametrize("name", ["FxLMS plain", "LimitedController"])
