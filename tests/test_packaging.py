@@ -28,7 +28,7 @@ README_COMMANDS = [
 ]
 # Extras and groups that the tests run without.
 NOT_FOR_TESTS = ("benchmark", "docs", "fmu", "realtime", "coverage", "dev", "lint", "mutants")
-LOADED_WHEN_FIRST_USED = ("jinja2", "control", "h5py", "matplotlib", "pooch", "pyuff", "soundfile", "tqdm")
+LOADED_WHEN_FIRST_USED = ("jinja2", "control", "h5py", "matplotlib", "pooch", "soundfile", "tqdm")
 
 
 def read(name: str) -> str:

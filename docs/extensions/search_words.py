@@ -7,7 +7,7 @@ from typing import Any
 WORDS = {
     "install": ("install", "pip", "Windows", "macOS", "requirements"),
     "index": ("cite", "licence"),
-    "formats": ("save", "checkpoint", "WAV", "MATLAB", "CSV", "SOFA", "HDF5", "sample rate", "recording"),
+    "formats": ("save", "checkpoint", "WAV", "MATLAB", "CSV", "HDF5", "sample rate", "recording"),
     "constraint": ("rated power", "limiter", "constraint factor"),
     "limits": ("limitations", "diverges"),
     "algorithms": ("FxLMS", "RLS", "algorithm"),

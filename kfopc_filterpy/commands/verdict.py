@@ -27,7 +27,7 @@ loudspeaker and each --primary one reference; the channels of these files are th
 channel, state the number of --microphones, and give the files source by source, the microphones of each in order:
   kfopc verdict noise.wav --microphones 2 --primary P11.wav --primary P21.wav \\
     --secondary S11.wav --secondary S21.wav --secondary S12.wav --secondary S22.wav --rated-power 1.6
-where S21 is loudspeaker 1 at microphone 2. An array (microphones, loudspeakers, taps) in a .npy, .mat or .sofa file holds
+where S21 is loudspeaker 1 at microphone 2. An array (microphones, loudspeakers, taps) in a .npy or .mat file holds
 all of them. Give each option of the rating once for all loudspeakers, or once for each, in their order.
 
 exit code: 0 enough, 1 not enough, 2 wrong input"""

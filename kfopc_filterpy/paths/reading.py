@@ -25,11 +25,11 @@ def read_path(
     unit_per_full_scale: float | None = None,
     file_fs: float | None = None,
 ) -> Recording:
-    """Read the impulse response of a path: all formats of `read_recording`, text exported by REW, and SOFA.
+    """Read the impulse response of a path: all formats of `read_recording`, and text exported by REW.
 
     At another rate, an impulse response keeps its sum, which is the path's gain, where a recording keeps its height; so
     `resample_path` is what resamples it. The first tap is at time 0. A file that states the time of its first sample (REW,
-    UFF, text with a column of times) is shifted, to the nearest sample, and what is before time 0 is cut off.
+    text with a column of times) is shifted, to the nearest sample, and what is before time 0 is cut off.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def read_path(
     variable : str, optional
         Variable of a .mat or .npz file, or field of a struct: "meas.ir". By default the only one with several values.
     unit : str, optional
-        Unit of the taps, after scaling: "Pa/V". By default what the file states, or "1".
+        Unit of the taps, after scaling: "Pa/V". By default "1".
     unit_per_full_scale : float, optional
         What the number 1 in the file stands for, in `unit`: the factor of the recording at the path's end over the factor of
         the signal at its beginning.
@@ -54,7 +54,7 @@ def read_path(
     -------
     Recording
         Taps as float64: (n_taps,); (n_channels, n_taps) from a file with several channels; (K microphones,
-        J loudspeakers, n_taps) from SOFA (receivers, measurements or emitters) and from arrays with three axes.
+        J loudspeakers, n_taps) from arrays with three axes.
 
     Raises
     ------

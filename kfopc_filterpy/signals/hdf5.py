@@ -1,4 +1,4 @@
-"""HDF5 files: MATLAB's version 7.3, and SOFA. They are read in a process of their own, see `child`."""
+"""MATLAB files of version 7.3, which are HDF5. They are read in a process of their own, see `child`."""
 
 from __future__ import annotations
 
@@ -28,12 +28,6 @@ def read_mat73(path: str | os.PathLike[str], variable: str | None) -> Content:
     """Return one variable of a MATLAB file of version 7.3."""
     _h5py(path)
     return read_in_child("h5py", read_mat73_here, path, variable)
-
-
-def read_sofa(path: str | os.PathLike[str]) -> Content:
-    """Return the impulse responses of a SOFA file (AES69), (receivers, sources, n_taps), with their delays."""
-    _h5py(path)
-    return read_in_child("h5py", read_sofa_here, path)
 
 
 def read_mat73_here(path: str | os.PathLike[str], variable: str | None) -> Content:
@@ -67,52 +61,6 @@ def read_mat73_here(path: str | os.PathLike[str], variable: str | None) -> Conte
             variable,
             others,
         )
-
-
-def read_sofa_here(path: str | os.PathLike[str]) -> Content:
-    """Return what `read_sofa` does, in this process."""
-    with _h5py(path).File(path, "r") as file:
-        kind = _text(file.attrs.get("DataType"))
-        if _text(file.attrs.get("Conventions")) != "SOFA" or kind not in ("FIR", "FIR-E"):
-            raise ValueError(
-                f"{path} must be a SOFA file with impulse responses (DataType FIR or FIR-E), got {kind!r}; export other "
-                "data as WAV, .mat or .npz"
-            )
-        responses = _read(path, file, "Data.IR")
-        rates = np.unique(_read(path, file, "Data.SamplingRate"))
-        delays = _read(path, file, "Data.Delay") if "Data.Delay" in file else np.zeros(1)
-    if responses.ndim != (3 if kind == "FIR" else 4) or rates.size != 1:
-        raise ValueError(
-            f"{path} must have impulse responses (measurements, receivers, taps) at one rate, got shape "
-            f"{responses.shape} at {rates.size} rates"
-        )
-    if kind == "FIR-E":  # (M, R, N, E)
-        if len(responses) != 1:
-            raise ValueError(f"{path} has several emitters in each of {len(responses)} measurements, expected one")
-        responses, delays = np.moveaxis(responses[0], 2, 0), np.moveaxis(np.atleast_1d(delays)[0], -1, 0)
-    taps = _delayed(path, np.swapaxes(responses, 0, 1), np.swapaxes(np.atleast_2d(delays), 0, 1))
-    return Content(taps[0, 0] if taps.shape[:2] == (1, 1) else taps, float(rates[0]))
-
-
-def _delayed(path: str | os.PathLike[str], taps: np.ndarray, delays: np.ndarray) -> np.ndarray:
-    """Return taps (K, J, n_taps) with as many zeros before each as its delay in samples says."""
-    if taps.size == 0:
-        raise ValueError(f"{path} holds no taps: its impulse responses have shape {taps.shape}")
-    try:
-        samples = np.broadcast_to(delays, taps.shape[:2])
-    except ValueError as error:
-        raise ValueError(f"{path} has delays of shape {delays.shape} for paths of {taps.shape[:2]}") from error
-    if not np.all((samples >= 0) & (samples == np.floor(samples)) & np.isfinite(samples)):
-        raise ValueError(f"{path} has delays that are no whole numbers of samples: shift its impulse responses instead")
-    longest = float(np.max(samples))
-    require_room(path, math.prod(taps.shape[:2]) * (taps.shape[2] + longest))
-    if longest == 0:
-        return taps
-    result = np.zeros((*taps.shape[:2], taps.shape[2] + int(longest)))
-    for index in np.ndindex(taps.shape[:2]):
-        begin = int(samples[index])
-        result[index][begin : begin + taps.shape[2]] = taps[index]
-    return result
 
 
 def _h5py(path: str | os.PathLike[str]) -> Any:

@@ -36,10 +36,8 @@ from .content import (
     require_room,
     rounding_of,
 )
-from .hdf5 import read_sofa
 from .matlab import read_mat
 from .text import Table, read_text, without_time
-from .uff import read_uff
 
 _REFERENCE_PRESSURE = 20e-6  # Pa, of sound pressure levels
 _LEAST_TONE_S = 0.5  # of a calibrator
@@ -76,12 +74,10 @@ _AUDIO_HEADS = (
 )
 _AUDIO = _Format("an audio file", read_audio, _AUDIO_FILES + _REFUSED_AUDIO, _AUDIO_HEADS)
 _MAT = _Format("a MAT file", read_mat, (".mat",), (b"MATLAB",), has_variables=True, holds_arrays=True)
-_UFF = _Format("a UFF file", read_uff, (".uff", ".unv", ".uf", ".58"))
-_SOFA = _Format("a SOFA file", read_sofa, (".sofa",), (b"\x89HDF",))
 _TEXT = _Format("text", read_text, (".txt", ".csv", ".tsv", ".dat", ".asc", ".lvm", ".frd", ".zma"))
 _NPY = _Format("a .npy file", read_npy, (".npy",), (b"\x93NUMPY",), holds_arrays=True)
 _NPZ = _Format("a .npz file", read_npz, (".npz",), (b"PK\x03\x04",), has_variables=True, holds_arrays=True)
-_FORMATS = (_AUDIO, _MAT, _UFF, _SOFA, _TEXT, _NPY, _NPZ)
+_FORMATS = (_AUDIO, _MAT, _TEXT, _NPY, _NPZ)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -181,7 +177,7 @@ def read_recording(
     level_db: float = 94.0,
     file_fs: float | None = None,
 ) -> Recording:
-    """Read a recording: WAV, RF64, FLAC, AIFF, MATLAB, .npy, .npz, text, CSV, LabVIEW's .lvm or UFF.
+    """Read a recording: WAV, RF64, FLAC, AIFF, MATLAB, .npy, .npz, text, CSV or LabVIEW's .lvm.
 
     The suffix of the file tells its format, or else how the file begins. Whole-number samples of audio files are scaled
     so that full scale is 1. In formats that hold arrays, the longer axis is time. A first column of text that rises evenly
@@ -358,7 +354,7 @@ def read_content(path: str | os.PathLike[str], *, channel: int | None = None, va
         content = kind.read(path, variable) if kind.has_variables else kind.read(path)
     if content.fs is not None:
         as_rate(content.fs, f"the rate that {path} states")
-    if content.samples.ndim == 3 and kind is not _SOFA and max(content.samples.shape[:2]) >= content.samples.shape[2]:
+    if content.samples.ndim == 3 and max(content.samples.shape[:2]) >= content.samples.shape[2]:
         raise ValueError(
             f"{path} has the shape {content.samples.shape}, expected (microphones, loudspeakers, taps) with the taps last: "
             "which axis is which? Store it in that order; (taps, microphones, loudspeakers) becomes it with MATLAB's "
@@ -410,9 +406,7 @@ def _format_of(path: str | os.PathLike[str]) -> _Format:
         return _AUDIO
     if head[512:516] == b"\x89HDF":
         return _MAT
-    lines = head.split(b"\n", 2)
-    is_uff = lines[0].rstrip() == b"    -1" and len(lines) > 1 and lines[1].startswith(b"    58")
-    return _UFF if is_uff else _TEXT
+    return _TEXT
 
 
 def rates_of(

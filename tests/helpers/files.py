@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -95,49 +94,6 @@ def _rew(path: Path) -> None:
     path.write_text(rew_text(signal()), encoding="utf-8")
 
 
-def write_uff(path: Path, channels: np.ndarray, *, start_s: float = 0.0, binary: int = 0, func_type: int = 1) -> None:
-    """Write each channel as a data set 58, in pascal."""
-    pyuff = pytest.importorskip("pyuff")
-    path.unlink(missing_ok=True)
-    for index, channel in enumerate(np.atleast_2d(channels)):
-        data = pyuff.prepare_58(
-            binary=binary, func_type=func_type, rsp_node=index + 1, rsp_dir=1, ref_dir=1, ref_node=1, data=channel,
-            x=start_s + np.arange(channel.size) / FS, id1="a fan", rsp_ent_name="mic", ref_ent_name="mic",
-            abscissa_spacing=1, abscissa_spec_data_type=17, ordinate_spec_data_type=15, ordinate_axis_units_lab="Pa",
-            orddenom_spec_data_type=0, abscissa_min=start_s, abscissa_inc=1 / FS, num_pts=channel.size,
-            ord_data_type=4,
-        )  # fmt: skip
-        with warnings.catch_warnings():  # it leaves a binary file to the garbage collector
-            warnings.simplefilter("ignore", ResourceWarning)
-            pyuff.UFF(str(path)).write_sets(data, mode="add")
-
-
-def _uff(path: Path) -> None:
-    write_uff(path, signal(2))
-
-
-def _uff_binary(path: Path) -> None:
-    write_uff(path, signal(2), binary=1)
-
-
-def write_sofa(path: Path, responses: np.ndarray, *, delay: object = 0.0) -> None:
-    """Write impulse responses (measurements, receivers, taps), or (measurements, receivers, taps, emitters)."""
-    sofar = pytest.importorskip("sofar")
-    sofa = sofar.Sofa("GeneralFIR" if responses.ndim == 3 else "GeneralFIR-E")
-    sofa.Data_IR, sofa.Data_SamplingRate = responses, float(FS)
-    shape = (1, responses.shape[1], *responses.shape[3:])
-    sofa.Data_Delay = np.full(shape, delay) if np.ndim(delay) == 0 else delay
-    sofa.ReceiverPosition = np.zeros((responses.shape[1], 3))
-    sofa.SourcePosition = np.array([[1.0, 0.0, 0.0]])
-    if responses.ndim == 4:
-        sofa.EmitterPosition = np.zeros((responses.shape[3], 3))
-    sofar.write_sofa(str(path), sofa)
-
-
-def _sofa(path: Path) -> None:
-    write_sofa(path, np.stack([signal(2), signal(2)[::-1]])[:, :, :64])
-
-
 WRITERS: dict[str, Callable[[Path], None]] = {
     "pcm16.wav": lambda path: _audio(path, subtype="PCM_16"),
     "float.wav": lambda path: _audio(path, subtype="FLOAT"),
@@ -154,7 +110,4 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "x.csv": _text,
     "timed.csv": _timed,
     "rew.txt": _rew,
-    "x.uff": _uff,
-    "binary.uff": _uff_binary,
-    "x.sofa": _sofa,
 }

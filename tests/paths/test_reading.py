@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.files import FS, rew_text, write_sofa, write_uff
+from helpers.files import FS, rew_text
 
 from kfopc_filterpy.paths import duct_plant, frequency_response, read_path, resample_path
 from kfopc_filterpy.signals import read_recording, write_wav
@@ -71,49 +71,14 @@ def test_rew_without_what_a_path_needs_is_refused(changed, message, tmp_path):
         read_path(rew(tmp_path, [0.0, 0.0, 1.0, -0.5], **changed))
 
 
-def test_times_in_text_and_uff_shift_a_path_too(tmp_path):
+def test_times_in_text_shift_a_path_too(tmp_path):
     times = (np.arange(50) - 10) / FS
     taps = np.where(times < 0, 0.0, np.exp(-times * 1000))
     np.savetxt(tmp_path / "s.csv", np.column_stack([times, taps]), delimiter=",")
-    write_uff(tmp_path / "s.uff", taps, start_s=-10 / FS)
-    for name in ("s.csv", "s.uff"):
-        np.testing.assert_allclose(read_path(tmp_path / name).samples, taps[10:], atol=1e-11)
+    np.testing.assert_allclose(read_path(tmp_path / "s.csv").samples, taps[10:], atol=1e-11)
 
 
 # ---- matrices
-
-
-@pytest.mark.parametrize("loudspeakers", ["measurements", "emitters"])
-def test_sofa_has_receivers_before_sources_and_its_delays(loudspeakers, tmp_path):
-    wanted = np.random.default_rng(3).standard_normal((2, 3, 40))  # (receivers, loudspeakers, taps)
-    delays = np.array([[0.0, 1.0, 5.0], [2.0, 0.0, 3.0]])
-    if loudspeakers == "measurements":
-        responses, delay = wanted.swapaxes(0, 1), delays.T
-    else:
-        responses, delay = wanted.swapaxes(1, 2)[np.newaxis], delays[np.newaxis]
-    write_sofa(tmp_path / "x.sofa", responses)
-    paths = read_path(tmp_path / "x.sofa")
-    np.testing.assert_array_equal(paths.samples, wanted)
-    assert paths.fs == FS
-    assert "2 x 3 x 40 samples" in repr(paths)
-    write_sofa(tmp_path / "x.sofa", responses, delay=delay)
-    late = read_path(tmp_path / "x.sofa").samples
-    assert late.shape == (2, 3, 45)
-    for place, begin in np.ndenumerate(delays.astype(int)):
-        np.testing.assert_array_equal(late[place][begin : begin + 40], wanted[place])
-        assert np.count_nonzero(late[place]) == 40
-
-
-def test_sofa_of_one_path_and_what_it_may_not_be(tmp_path):
-    responses = np.random.default_rng(3).standard_normal((1, 1, 40))
-    write_sofa(tmp_path / "x.sofa", responses)
-    assert read_path(tmp_path / "x.sofa").samples.shape == (40,)
-    write_sofa(tmp_path / "x.sofa", responses, delay=0.5)
-    with pytest.raises(ValueError, match=r"x\.sofa has delays that are no whole numbers of samples"):
-        read_path(tmp_path / "x.sofa")
-    write_sofa(tmp_path / "x.sofa", np.ones((2, 2, 40, 3)))
-    with pytest.raises(ValueError, match=r"x\.sofa has several emitters in each of 2 measurements, expected one"):
-        read_path(tmp_path / "x.sofa")
 
 
 def test_a_matrix_of_taps_keeps_its_axes_and_has_no_channels(tmp_path):

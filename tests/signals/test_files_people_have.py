@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.io
 import soundfile
-from helpers.files import FS, signal, write_uff
+from helpers.files import FS, signal
 
 from kfopc_filterpy.paths import read_path
 from kfopc_filterpy.signals import read_recording
@@ -487,29 +487,3 @@ def test_a_rate_by_times_of_few_digits_is_said(tmp_path):
     (tmp_path / "x.csv").write_text("t,p\n" + times(".5f", 44100))
     with pytest.warns(UserWarning, match=r"which allow 44088 Hz \+- 49 Hz: it is taken to be sampled at 44100 Hz"):
         read_recording(tmp_path / "x.csv")
-
-
-# ---- UFF
-
-
-@pytest.mark.parametrize("n_samples", [61, 62, 64])
-@pytest.mark.parametrize("end", [b"\n", b"\r\n"])
-def test_a_uff_whose_last_row_is_padded_with_blanks_is_read(tmp_path, n_samples, end):
-    path = tmp_path / "x.uff"
-    write_uff(path, signal(2)[:, :n_samples])
-    lines = path.read_bytes().splitlines()
-    path.write_bytes(end.join(line.ljust(80) if line.strip() != b"-1" else line for line in lines) + end)
-    np.testing.assert_allclose(read_recording(path).samples, signal(2)[:, :n_samples], rtol=0, atol=1e-11)  # 13 digits
-
-
-@pytest.mark.parametrize(("fill", "is_read"), [("0.00000000000e+00", True), ("1.00000000000e+00", False)])
-def test_a_uff_whose_last_row_is_filled_with_zeros_is_read(tmp_path, fill, is_read):
-    path = tmp_path / "x.uff"
-    write_uff(path, signal()[:62])
-    before, end, after = path.read_text().rpartition("\n    -1")
-    path.write_text(before + 2 * f"{fill:>20}" + end + after)
-    if is_read:
-        np.testing.assert_allclose(read_recording(path).samples, signal()[:62], rtol=0, atol=1e-11)  # 13 digits
-        return
-    with pytest.raises(ValueError, match=r"x\.uff is damaged .* claims 62 samples, 64 could be read"):
-        read_recording(path)
