@@ -257,7 +257,7 @@ WORDS = [
     *("--primary", "--secondary", "--disturbance", "--fs", "--channel", "--variable", "--taps", "--memory", "--watt"),
     *("--ohm", "--rated-power", "--want-db", "--volts-per-unit", "--peak-volts", "--json", "--algorithm", "--seconds"),
     *("0", "-1", "1", "1e-300", "1e300", "1e400", "nan", "inf", "-inf", "8000", "8000.5", "0.1", "abc", "10" * 30),
-    *("KF-PB", "FxLMS", "KF-OPC,FxLMS", "--impedance", "--path-error-samples", "--no-such-option"),
+    *("KF-PB", "FxLMS", "KF-OPC,FxLMS", "--path-error-samples", "--no-such-option"),
 ]
 # Complete commands that one word at a time is changed in; `run` is short, and `verdict` has so few taps that it is fast.
 SCENE = ["noise.wav", "--primary", "P.wav", "--secondary", "S.wav", "--rated-power", "0.1"]

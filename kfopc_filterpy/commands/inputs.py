@@ -234,10 +234,7 @@ def _each(given: list[Any] | None, option: str, count: int, what: str) -> list[A
     return given * (count if len(given) == 1 else 1)
 
 
-OF_A_LOUDSPEAKER = (
-    *("watt", "ohm", "peak_volts", "volts_per_unit", "rated_power"),
-    *("impedance", "loudspeaker_watt", "programme_watt", "x_max_mm", "displacement"),
-)
+OF_A_LOUDSPEAKER = ("watt", "ohm", "peak_volts", "volts_per_unit", "rated_power", "loudspeaker_watt")
 
 
 def ratings_of(options: argparse.Namespace, n_loudspeakers: int) -> list[Any]:
@@ -257,13 +254,6 @@ def _rating(own: argparse.Namespace) -> list[Any]:
     """Return the ratings of one loudspeaker."""
     from ..power import AmplifierRating, LoudspeakerRating
 
-    if own.loudspeaker_watt is not None and own.programme_watt is not None:
-        raise ValueError("--programme-watt stands in place of --loudspeaker-watt: leave out one of them")
-    if (own.x_max_mm is None) != (own.displacement is None):
-        raise ValueError(
-            "--x-max-mm and --displacement must be given together: the excursion limit needs to know how far a volt moves "
-            "the cone"
-        )
     ratings: list[Any] = []
     used = {"rated_power"}
     if own.watt is not None or own.peak_volts is not None:
@@ -276,41 +266,20 @@ def _rating(own: argparse.Namespace) -> list[Any]:
         used |= {"watt", "peak_volts", "ohm", "volts_per_unit"} | ({"rating"} if own.watt is not None else set())
     elif own.rated_power is not None:
         ratings.append(own.rated_power)
-    if (own.loudspeaker_watt, own.programme_watt, own.x_max_mm) != (None, None, None):
-        if own.ohm is None and own.impedance is None:
-            raise ValueError("a loudspeaker's rating needs --ohm, its nominal impedance, or --impedance, its curve")
-        ratings.append(
-            LoudspeakerRating(
-                own.ohm if own.impedance is None else _curve(own.impedance, "ohm"),
-                noise_watt=own.loudspeaker_watt,
-                programme_watt=own.programme_watt,
-                x_max_mm=own.x_max_mm,
-                displacement_mm_per_volt=None if own.displacement is None else _curve(own.displacement, "mm/V"),
-                volts_per_unit=own.volts_per_unit,
-            )
-        )
-        used |= {*OF_A_LOUDSPEAKER} - ({"ohm"} if own.impedance is not None else set())
+    if own.loudspeaker_watt is not None:
+        if own.ohm is None:
+            raise ValueError("a loudspeaker's rating needs --ohm, its nominal impedance")
+        ratings.append(LoudspeakerRating(own.ohm, noise_watt=own.loudspeaker_watt, volts_per_unit=own.volts_per_unit))
+        used |= {"loudspeaker_watt", "ohm", "volts_per_unit"}
     if not ratings:
         raise ValueError("a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6")
     refuse_unused(
         own,
         [name for name in vars(own) if name not in used],
-        ": --ohm, --rating and --volts-per-unit belong to --watt, and --impedance to --loudspeaker-watt, "
-        "--programme-watt or --x-max-mm; add these, or leave it out",
+        ": --ohm and --volts-per-unit belong to --watt or --loudspeaker-watt, and --rating to --watt; add these, or leave it "
+        "out",
     )
     return ratings
-
-
-def _curve(path: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first two columns of a text file: frequencies, and values in a unit."""
-    from ..power.ratings import as_curve
-    from ..signals.content import reading, require_file
-    from ..signals.text import read_table
-
-    require_file(path)
-    with reading(path, f"a curve, two columns of Hz and {unit}"):
-        columns = read_table(path, n_least=2).columns
-    return as_curve((columns[:, 0], columns[:, 1]), path, unit)
 
 
 def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndarray) -> Uncertainty:

@@ -119,13 +119,7 @@ def add_recorded_scene(parser: argparse._ActionsContainer) -> None:
     about = "volts for a control signal of 1; without it, 1 V is assumed, and results are not in watts"
     add_number(rating, "--volts-per-unit", "V", help=about, **each)
     add_number(rating, "--rated-power", "", metavar="P", help="rated power as mean square, in place of watts", **each)
-    about = "the loudspeaker's impedance, whose smallest value counts, in columns of Hz and ohm (default: --ohm)"
-    rating.add_argument("--impedance", metavar="CSV", help=about, **each)
     add_number(rating, "--loudspeaker-watt", "W", help="rated noise power of the loudspeaker", **each)
-    add_number(rating, "--programme-watt", "W", help="its programme power, in place of --loudspeaker-watt", **each)
-    add_number(rating, "--x-max-mm", "mm", help="its largest excursion, one way", **each)
-    about = "its excursion per volt, in columns of Hz and mm/V"
-    rating.add_argument("--displacement", metavar="CSV", help=about, **each)
 
 
 def prepare_output(options: argparse.Namespace) -> None:

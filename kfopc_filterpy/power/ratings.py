@@ -1,4 +1,4 @@
-r"""Ratings as data sheets have them, and what they allow a control signal: a mean power, a peak, an excursion.
+r"""Ratings as data sheets have them, and what they allow a control signal: a mean power and a peak.
 
 A control signal y is in units of its own; one unit is `volts_per_unit` volts at the amplifier's output. With the
 impedance R in ohm, a power of P watts is the mean square
@@ -33,18 +33,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-import numpy as np
-from numpy.typing import ArrayLike
-
 from .._types import NumberOrArray
-from .._validate import as_positive, as_real_array, as_signal, require_finite
+from .._validate import as_positive
 from .limiter import DEFAULT_WINDOW_S, OutputLimiter
 
 SINE_CREST, NOISE_CREST = math.sqrt(2.0), 2.0
-PROGRAMME_OVER_NOISE = 2.0
 THERMAL_WINDOW_S = 10.0  # shorter than the seconds to minutes in which a voice coil and its magnet heat up
 
 
@@ -77,30 +73,38 @@ class OutputLimits:
 class _Rating:
     """What ratings of amplifiers and of loudspeakers have in common."""
 
-    ohm: Any
+    ohm: float
+    sine_watt: float | None
+    noise_watt: float | None
     peak_volts: float | None
     volts_per_unit: float | None
+
+    def __post_init__(self) -> None:
+        units = {"sine_watt": "W", "noise_watt": "W", "peak_volts": "V", "volts_per_unit": "V"}
+        given = [name for name in units if getattr(self, name) is not None]
+        for name in given:
+            as_positive(getattr(self, name), name, unit=units[name])
+        as_positive(self.ohm, "ohm", unit="ohm")
+        powers = [name for name in given if name.endswith("watt")]
+        if len(powers) > 1 or not (powers or self.peak_volts is not None):
+            raise ValueError(
+                f"a rating must have sine_watt or noise_watt, or else peak_volts, got {' and '.join(powers) or 'none of them'}; "
+                "if the data sheet of an amplifier does not say, give sine_watt"
+            )
 
     @property
     def volts(self) -> float:
         """Volts for a control signal of 1; 1 if they are not known."""
         return 1.0 if self.volts_per_unit is None else self.volts_per_unit
 
-    def _check_optional(self, **units: str) -> None:
-        """Raise an error if one of these, by its unit, is given and not a positive number."""
-        for name, unit in units.items():
-            if getattr(self, name) is not None:
-                as_positive(getattr(self, name), name, unit=unit)
-
-    def _given(self, *names: str) -> list[str]:
-        """Return which of these are given."""
-        return [name for name in names if getattr(self, name) is not None]
-
-    def _mean_square(self, watts: float | None) -> float:
-        """Return the rated power from the watts, or from the peak voltage if there are none; Inf if there is neither."""
-        if watts is not None:
-            return watts * self.ohm / self.volts**2
-        return math.inf if self.peak_volts is None else (self.peak_volts / self.volts) ** 2 / 2.0
+    @property
+    def rated_power(self) -> float:
+        """Rated power ρ_o, the largest mean square of the control signal; without watts, that of a sine at the peak voltage."""
+        watts = self.noise_watt if self.sine_watt is None else self.sine_watt
+        if watts is None:
+            assert self.peak_volts is not None
+            return (self.peak_volts / self.volts) ** 2 / 2.0
+        return watts * self.ohm / self.volts**2
 
     def watt(self, power: NumberOrArray) -> NumberOrArray:
         """Return the watts of a mean square `power` of the control signal."""
@@ -149,21 +153,6 @@ class AmplifierRating(_Rating):
     peak_volts: float | None = None
     volts_per_unit: float | None = None
 
-    def __post_init__(self) -> None:
-        as_positive(self.ohm, "ohm", unit="ohm")
-        self._check_optional(sine_watt="W", noise_watt="W", peak_volts="V", volts_per_unit="V")
-        given = self._given("sine_watt", "noise_watt")
-        if len(given) > 1 or (not given and self.peak_volts is None):
-            raise ValueError(
-                f"an amplifier's rating must have sine_watt or noise_watt, or else peak_volts, got "
-                f"{' and '.join(given) or 'none of them'}; if the data sheet does not say, give sine_watt"
-            )
-
-    @property
-    def rated_power(self) -> float:
-        """Rated power ρ_o, the largest mean square of the control signal."""
-        return self._mean_square(self.noise_watt if self.sine_watt is None else self.sine_watt)
-
     @property
     def amplitude_limit(self) -> float:
         """Magnitude of the control signal at which the amplifier clips."""
@@ -178,106 +167,43 @@ class AmplifierRating(_Rating):
         return OutputLimits(self.rated_power, self.amplitude_limit, DEFAULT_WINDOW_S, "amplifier")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class LoudspeakerRating(_Rating):
-    r"""Rating of a loudspeaker: the heat that its voice coil bears, and how far its cone may move.
+    r"""Rating of a loudspeaker: the heat that its voice coil bears, and its largest voltage.
 
-    The thermal rating is a mean over seconds. It becomes the rated power of a controller and a long window of the
-    limiter. The excursion becomes a rated power too: the displacement is h * y, with the displacement response h, and
-    `excursion_rated_power` says which power a control signal may have so that its displacement stays within the limit.
-    KF-PB has no further constraint on h * y: it would need a second weight beside λ, and correlations of h * x for each
-    pair of taps.
+    The thermal rating is a mean over seconds. It becomes the rated power of a controller and a window of ten seconds of
+    the limiter. The excursion of the cone is not limited: where it counts, at low frequencies, state `peak_volts`.
 
     Parameters
     ----------
-    ohm : float or pair of array_like
-        Nominal impedance in ohm, or a curve: frequencies in Hz and magnitudes in ohm, each (n_points,). Of a curve the
-        smallest value counts, as AES2 has it; the actual power is never above this voltage squared over it.
+    ohm : float
+        Nominal impedance in ohm, or the smallest of its curve, as AES2 has it.
     noise_watt : float, optional
-        Rated noise power in W (IEC 60268-5, AES2).
+        Rated noise power in W (IEC 60268-5, AES2). Of a programme power, it is the half.
     sine_watt : float, optional
         Rated sinusoidal power in W.
-    programme_watt : float, optional
-        Programme power in W. Its half counts as noise power.
     peak_volts : float, optional
-        Largest voltage in V.
-    x_max_mm : float, optional
-        Largest excursion of the cone from its rest position in mm, one way.
-    displacement_mm_per_volt : float or pair of array_like, optional
-        Excursion per volt in mm/V: one number, or a curve: frequencies in Hz and magnitudes in mm/V, each (n_points,),
-        constant beyond its ends. It is needed with `x_max_mm`.
-    excursion_crest_factor : float, default 2
-        Peak over rms of the displacement that is expected: sqrt(2) for a tone, 2 for noise that is clipped.
-    thermal_window_s : float, default 10
-        Time in seconds over which the mean power counts.
+        Largest voltage in V. Without a power, the power is that of the sine that peaks at this voltage.
     volts_per_unit : float, optional
         Volts at the loudspeaker for a control signal of 1, as for an `AmplifierRating`.
 
     Raises
     ------
     TypeError, ValueError
-        No rating or two powers; an excursion without a displacement response, or the reverse; a number that is not above
-        zero; a curve whose frequencies do not rise.
+        No rating or two powers; a number that is not above zero.
 
     Examples
     --------
-    A 30 W loudspeaker of 6 ohm at its minimum, with 3 mm of excursion and a resonance at 80 Hz:
-
-    >>> import numpy as np
     >>> from kfopc_filterpy.power import LoudspeakerRating
-    >>> f = np.array([20.0, 50.0, 80.0, 160.0, 320.0, 640.0])
-    >>> rating = LoudspeakerRating(
-    ...     ohm=(f, [7.0, 12.0, 40.0, 9.0, 6.0, 8.0]), noise_watt=30.0, x_max_mm=3.0,
-    ...     displacement_mm_per_volt=(f, 0.4 / np.sqrt((1 - (f / 80) ** 2) ** 2 + (f / 80) ** 2)),
-    ... )
-    >>> rating.rated_power
+    >>> LoudspeakerRating(ohm=6.0, noise_watt=30.0).rated_power
     180.0
-    >>> t = np.arange(16000) / 16000
-    >>> for hz in (80, 320):  # what a tone may have before the cone moves too far
-    ...     print(f"{hz} Hz: {rating.excursion_rated_power(np.sin(2 * np.pi * hz * t), 16000):.0f} V^2")
-    80 Hz: 14 V^2
-    320 Hz: 3389 V^2
     """
 
-    ohm: Any
+    ohm: float
     noise_watt: float | None = None
     sine_watt: float | None = None
-    programme_watt: float | None = None
     peak_volts: float | None = None
-    x_max_mm: float | None = None
-    displacement_mm_per_volt: Any = None
-    excursion_crest_factor: float = NOISE_CREST
-    thermal_window_s: float = THERMAL_WINDOW_S
     volts_per_unit: float | None = None
-    _curve: tuple[np.ndarray, np.ndarray] | None = field(init=False, repr=False, compare=False, default=None)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "ohm", float(np.min(as_curve(self.ohm, "ohm", "ohm")[1])))
-        units = {"noise_watt": "W", "sine_watt": "W", "programme_watt": "W", "peak_volts": "V", "x_max_mm": "mm"}
-        self._check_optional(**units, volts_per_unit="V")
-        for name in ("excursion_crest_factor", "thermal_window_s"):
-            as_positive(getattr(self, name), name)
-        powers = self._given("noise_watt", "sine_watt", "programme_watt")
-        if len(powers) > 1 or not (powers or self.peak_volts is not None or self.x_max_mm is not None):
-            raise ValueError(
-                "a loudspeaker's rating must have one of noise_watt, sine_watt and programme_watt, or else peak_volts or "
-                f"x_max_mm, got {' and '.join(powers) or 'none of them'}; take noise_watt if the data sheet has it"
-            )
-        if (self.x_max_mm is None) != (self.displacement_mm_per_volt is None):
-            raise ValueError(
-                "x_max_mm and displacement_mm_per_volt must be given together: the excursion limit needs to know how far "
-                "a volt moves the cone"
-            )
-        if self.displacement_mm_per_volt is not None:
-            curve = as_curve(self.displacement_mm_per_volt, "displacement_mm_per_volt", "mm/V")
-            object.__setattr__(self, "_curve", curve)
-
-    @property
-    def rated_power(self) -> float:
-        """Rated power ρ_o from the watts, or from the peak voltage if there are none; Inf if there is neither."""
-        if self.programme_watt is not None:
-            return self._mean_square(self.programme_watt / PROGRAMME_OVER_NOISE)
-        return self._mean_square(self.noise_watt if self.sine_watt is None else self.sine_watt)
 
     @property
     def amplitude_limit(self) -> float | None:
@@ -286,42 +212,8 @@ class LoudspeakerRating(_Rating):
 
     @property
     def limits(self) -> OutputLimits:
-        """Limits of the control signal without the excursion; the mean power counts over `thermal_window_s`."""
-        return OutputLimits(self.rated_power, self.amplitude_limit, self.thermal_window_s, "loudspeaker's power")
-
-    def displacement_mm(self, control_signal: ArrayLike, fs: float) -> np.ndarray:
-        """Return the displacement h * y of the cone in mm, (n_samples,), at a sample rate `fs` in Hz.
-
-        The response of zero phase is applied to the whole `control_signal`, (n_samples,), as if it repeated: rms values
-        are right for any phase, peaks nearly so.
-        """
-        if self._curve is None:
-            raise ValueError("displacement_mm needs a rating with displacement_mm_per_volt")
-        y = as_signal(control_signal, "control_signal")
-        frequencies = np.fft.rfftfreq(y.size, 1.0 / as_positive(fs, "fs", unit="Hz"))
-        response = np.interp(frequencies, *self._curve) * self.volts
-        return np.fft.irfft(np.fft.rfft(y) * response, y.size)
-
-    def excursion_rated_power(self, control_signal: ArrayLike, fs: float) -> float:
-        """Return the largest mean square that a signal of this spectrum may have for the excursion; Inf without a limit.
-
-        The mean square of h * y is then that of a displacement that peaks at `x_max_mm` with `excursion_crest_factor`.
-        A silent signal has no limit.
-
-        Parameters
-        ----------
-        control_signal : array_like, shape (n_samples,)
-            Control signal y; only its spectrum counts, not its level.
-        fs : float
-            Sample rate in Hz.
-        """
-        if self.x_max_mm is None:
-            return math.inf
-        moved = float(np.mean(self.displacement_mm(control_signal, fs) ** 2))
-        power = float(np.mean(np.asarray(control_signal, dtype=np.float64) ** 2))
-        if moved == 0.0:
-            return math.inf
-        return power * (self.x_max_mm / self.excursion_crest_factor) ** 2 / moved
+        """Limits of the control signal; the mean power counts over ten seconds."""
+        return OutputLimits(self.rated_power, self.amplitude_limit, THERMAL_WINDOW_S, "loudspeaker's power")
 
 
 Rating: TypeAlias = float | AmplifierRating | LoudspeakerRating | OutputLimits  # a number is a rated power
@@ -340,13 +232,12 @@ def output_limits(rating: Rating | Sequence[Rating]) -> OutputLimits:
     Returns
     -------
     OutputLimits
-        The limits. The excursion of a loudspeaker is not among them, because it depends on the spectrum; see
-        `LoudspeakerRating.excursion_rated_power`.
+        The limits.
 
     Raises
     ------
     TypeError, ValueError
-        Something else than a rating; no rating that limits the mean power; two ratings whose `volts_per_unit` differ.
+        Something else than a rating; two ratings whose `volts_per_unit` differ.
 
     Examples
     --------
@@ -368,8 +259,6 @@ def output_limits(rating: Rating | Sequence[Rating]) -> OutputLimits:
         )
     each = [_limits(one) for one in ratings]
     least = min(each, key=lambda limits: limits.rated_power)
-    if not math.isfinite(least.rated_power):
-        raise ValueError("rating must limit the mean power: give watts, peak volts or a rated power")
     peaks = [limits.amplitude_limit for limits in each if limits.amplitude_limit is not None]
     peak, window_s = min(peaks, default=None), min(limits.window_s for limits in each)
     return OutputLimits(least.rated_power, peak, window_s, least.decided_by)
@@ -385,22 +274,3 @@ def _limits(rating: Any) -> OutputLimits:
     except TypeError:
         wanted = "a rated power, an AmplifierRating or a LoudspeakerRating"
         raise TypeError(f"rating must be {wanted}, got {rating!r}") from None
-
-
-def as_curve(value: float | Sequence[ArrayLike] | np.ndarray, name: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return a curve's frequencies and values; one number holds at all frequencies."""
-    if not isinstance(value, list | tuple | np.ndarray):
-        return np.array([0.0]), np.array([as_positive(value, name, unit=unit)])
-    try:
-        frequencies, values = (as_real_array(part, name) for part in value)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be a number in {unit}, or frequencies in Hz and values in {unit}") from error
-    if frequencies.ndim != 1 or frequencies.shape != values.shape or frequencies.size == 0:
-        raise ValueError(f"{name} must have a value for each frequency, got {frequencies.shape} and {values.shape}")
-    require_finite(frequencies, f"the frequencies of {name}")
-    require_finite(values, name)
-    if np.any(np.diff(frequencies) <= 0) or frequencies[0] < 0:
-        raise ValueError(f"the frequencies of {name} must rise from 0 Hz or above")
-    if np.any(values <= 0):
-        raise ValueError(f"{name} must be greater than 0 {unit}, got {values.min():g} {unit}")
-    return frequencies, values

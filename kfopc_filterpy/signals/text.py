@@ -74,7 +74,7 @@ def read_text(path: str | os.PathLike[str]) -> Content:
         return _read_rew(path, head)
     if head and head[0].startswith(_LABVIEW):
         return _read_labview(path, head)
-    table = read_table(path)
+    table = _read_table(path)
     content = without_time(path, table)
     rounding = rounding_of(table.columns[:, 0]) / (np.ptp(table.columns[:, 0]) or 1.0)
     return content._replace(fs=agreed_rate(path, _stated_rate(path, table.header), content.fs, rounding))
@@ -101,12 +101,12 @@ def _units(names: list[str]) -> tuple[np.ndarray, str | None]:
     return factors, ", ".join(units[: 1 if len(set(units)) == 1 else None]) if any(found) else None
 
 
-def read_table(path: str | os.PathLike[str], *, n_least: int = 1) -> Table:
-    """Return the columns of a text file in any layout, of which there must be at least `n_least`."""
+def _read_table(path: str | os.PathLike[str]) -> Table:
+    """Return the columns of a text file in any layout."""
     head = list(islice(_lines(path), _LONGEST_HEADER))
     layout = _layout(path, head)
     header = [line for line in head[: layout.first] if line.strip()]
-    if n_least == 1 and layout.delimiter == "," and _ONE_COMMA.fullmatch(layout.plain(head[layout.first]).strip()):
+    if layout.delimiter == "," and _ONE_COMMA.fullmatch(layout.plain(head[layout.first]).strip()):
         heading = header[-1].strip() if header else ""
         if _is_decimal(path, heading, islice(_lines(path), layout.first, None)):
             layout = layout._replace(delimiter=None, has_decimal_comma=True)
@@ -122,8 +122,6 @@ def read_table(path: str | os.PathLike[str], *, n_least: int = 1) -> Table:
     n_names = len(header[-1].split(",")) if header and layout.delimiter == "," else 0
     if n_names > 1 and 2 * n_names == columns.shape[1] and not np.any(columns % 1):  # "t,p" above "0,125,0,5"
         raise _ambiguous(path)
-    if columns.shape[1] < n_least:
-        raise ValueError(f"{path} must hold {n_least} columns, got {columns.shape[1]}")
     names = layout.plain(header[-1]).split(layout.delimiter) if header and columns.shape[1] > 1 else header[-1:]
     return Table(header, columns, names if len(names) == columns.shape[1] else [])
 

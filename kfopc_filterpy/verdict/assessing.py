@@ -53,12 +53,10 @@ from .limits import (
     ChannelLimits,
     Limits,
     Ratings,
-    excursion_mm,
     limits_of,
     ratings_of_each,
     scale_of,
     watt_per_power,
-    with_excursion,
 )
 from .runs import NSE_WINDOW_S, Plan, announce, one_blas_thread
 
@@ -171,9 +169,6 @@ def assess(
     The algorithms run side by side, on as many cores as there are. The numerical libraries get one thread
     meanwhile: with filters of this size, more of them slow each other down.
 
-    If a loudspeaker's rating has an excursion, the rated power is the largest at which the best fixed filter's control
-    signal keeps it.
-
     With `feedback`, the disturbance one sample late is a reference, for the ceilings too: they are those of predictors, and
     there is no coherence. `paths.internal_model_margin` judges the settled loop with the plant's path and with any measured ones
     in `secondary_path_uncertainty`; the least margin counts.
@@ -231,7 +226,6 @@ def assess(
             max_taps=longest_filter(J * n_references),
         )
         bounds = FixedFilters(x[..., start:], d[..., start:], s, settings.n_taps, fs)
-        limits = with_excursion(limits, ratings, bounds)
         official = bounds.within(limits.rated_power)
         required = bounds.needed(want_db, limits.rated_power)
     if any(issubclass(warning.category, np.exceptions.RankWarning) for warning in caught):
@@ -312,7 +306,6 @@ def assess(
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
         band=_band(bounds.d, s, fs),
         levels=None if pascals is None else _levels(run, pascals),
-        excursion_mm=excursion_mm(ratings, run),
         settings=settings,
         figures=figures,
         runs=runs,

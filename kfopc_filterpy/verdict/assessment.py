@@ -153,8 +153,6 @@ class Assessment:
         Where the noise is.
     levels : SoundLevels or None
         Sound levels, if the calibration is known.
-    excursion_mm : float or None
-        Largest excursion in the run, if a loudspeaker's rating has one.
     settings : SuggestedSettings
         Length and noise variances of the Kalman filters.
     figures : dict of str to dict
@@ -202,7 +200,6 @@ class Assessment:
     helpful_delay_s: float | None
     band: Band
     levels: SoundLevels | None
-    excursion_mm: float | None
     settings: SuggestedSettings
     figures: Mapping[str, Mapping[str, Any]]
     runs: Mapping[str, SimulationResult]
@@ -292,7 +289,6 @@ class Assessment:
             "least_rated_power",
             "causality_margin_s",
             "helpful_delay_s",
-            "excursion_mm",
             "fs",
             "origin",
         )

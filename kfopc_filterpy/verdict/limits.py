@@ -8,16 +8,12 @@ from typing import Any, TypeAlias, TypeGuard, cast
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, LinearAmplifier, SimulationResult
+from kfopc_filterpy import HardClipAmplifier, LinearAmplifier
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating, OutputLimits, output_limits
 
 from .._types import NumberOrArray
 from ..power.amplifiers import Amplifier
 from ..power.ratings import Rating
-from .fixed_filters import FixedFilters
-
-EXCURSION = "loudspeaker's excursion"
-SWEEPS = 3  # over the loudspeakers: what one gives up, others may take over
 
 Ratings: TypeAlias = Rating | Sequence[Rating | Sequence[Rating]]  # of one loudspeaker, or of each
 
@@ -125,53 +121,6 @@ def amplifiers(limits: Limits) -> Amplifier | Sequence[Amplifier]:
     peaks = (one.amplitude_limit for one in each_of(limits))
     each = [LinearAmplifier() if peak is None else HardClipAmplifier(peak) for peak in peaks]
     return each if isinstance(limits, ChannelLimits) else each[0]
-
-
-def with_excursion(limits: Limits, ratings: Sequence[Sequence[Rating]], bounds: FixedFilters) -> Limits:
-    """Return limits with the largest rated powers at which the best filters keep the excursion of every loudspeaker."""
-    moving = _moving(ratings)
-    for _ in range(1 if len(ratings) == 1 else SWEEPS):
-        before = limits
-        for j, one in moving:
-            limits = _keeping(limits, j, one, bounds)
-        if limits is before:
-            break
-    return limits
-
-
-def _keeping(limits: Limits, j: int, rating: LoudspeakerRating, bounds: FixedFilters) -> Limits:
-    """Return limits with which the best filter keeps the excursion of loudspeaker j, the others' as they are."""
-    from scipy.optimize import brentq
-
-    each = each_of(limits)
-
-    def excess(log_power: float) -> float:
-        tried = [*each[:j], replace(each[j], rated_power=float(np.exp(log_power))), *each[j + 1 :]]
-        weights = bounds.limited(_like(limits, tried).rated_power)[0]
-        y = np.atleast_2d(bounds.stretch.control_signal(weights))[j]
-        return float(np.log(np.mean(y**2) / rating.excursion_rated_power(y, bounds.fs)))
-
-    high = np.log(each[j].rated_power)
-    if excess(high) <= 1e-3 * (each[j].decided_by == EXCURSION):
-        return limits
-    low = high - 1.0
-    while excess(low) > 0:
-        low -= 2.0
-    kept = replace(each[j], rated_power=float(np.exp(brentq(excess, low, high, xtol=1e-4))), decided_by=EXCURSION)
-    return _like(limits, [*each[:j], kept, *each[j + 1 :]])
-
-
-def excursion_mm(ratings: Sequence[Sequence[Rating]], run: SimulationResult) -> float | None:
-    """Return the largest excursion of a run, of any loudspeaker whose rating knows it."""
-    played = np.atleast_2d(np.nan_to_num(run.amplifier_output))
-    moved = [float(np.abs(one.displacement_mm(played[j], run.fs)).max()) for j, one in _moving(ratings)]
-    return max(moved, default=None)
-
-
-def _moving(ratings: Sequence[Sequence[Rating]]) -> list[tuple[int, LoudspeakerRating]]:
-    """Return the numbers of the loudspeakers whose largest excursion is known, with the ratings that state it."""
-    loudspeakers = [(j, one) for j, own in enumerate(ratings) for one in own if isinstance(one, LoudspeakerRating)]
-    return [(j, one) for j, one in loudspeakers if one.x_max_mm is not None]
 
 
 def watt_per_power(ratings: Sequence[Sequence[Rating]], several: bool) -> NumberOrArray | None:

@@ -283,8 +283,6 @@ def _checks(verdict: Assessment) -> dict[str, str]:
     if verdict.levels is not None:
         before, after = (listed(one, ".1f") for one in (verdict.levels.before_dba, verdict.levels.after_dba))
         checks["A-weighted level"] = f"{before} dBA without control, {after} dBA with it"
-    if verdict.excursion_mm is not None:
-        checks["Largest excursion"] = f"{verdict.excursion_mm:.2g} mm"
     return checks
 
 

@@ -27,8 +27,6 @@ def folder(tmp_path_factory):
     write_wav(here / "short.wav", signals["d"][:20000], FS)
     (here / "empty.wav").write_bytes(b"")
     (here / "text.wav").write_text("these are words")
-    (here / "falling.csv").write_text("80,8\n20,7\n")
-    (here / "rising.csv").write_text("20,7\n80,8\n")
     np.save(here / "untimed.npy", secondary)
     return here
 

@@ -39,9 +39,6 @@ ERRORS = {
     "verdict noise.wav PATHS --watt twenty --ohm 8": "--watt must be a single number in W, got 'twenty'",
     "verdict noise.wav PATHS --watt -20 --ohm 8": "--watt must be greater than 0 W, got -20; see kfopc verdict --help",
     "verdict noise.wav PATHS --loudspeaker-watt 1": "a loudspeaker's rating needs --ohm",
-    "verdict noise.wav PATHS --rated-power 1 --ohm 8 --x-max-mm 1": "--x-max-mm and --displacement must be",
-    "verdict noise.wav PATHS --ohm 8 --loudspeaker-watt 1 --programme-watt 2": "leave out one of them",
-    "verdict noise.wav PATHS --ohm 8 --loudspeaker-watt 1 --impedance falling.csv": "of falling.csv must",
     "verdict noise.wav PATHS --rated-power 1 --ohm -1": "--ohm must be greater than 0",
     # The option that an argument of the package comes from is named.
     "verdict noise.wav PATHS --rated-power 1 --algorithm KF": "--algorithm must be one of 'KF-PB'",
@@ -81,10 +78,8 @@ ERRORS = {
     "paths convert S.wav:S x.npy": "S.wav is an audio file, which has no named variables",
     "paths identify stereo.wav stereo.wav --channel 0 --taps 8 -o x.npy": "sample for sample: is it the error microphone?",
     # An option that nothing uses.
-    "verdict noise.wav PATHS --watt 20 --ohm 8 --impedance no-such.csv": "--impedance would not be used",
     "verdict noise.wav PATHS --rated-power 1 --ohm 8 --volts-per-unit 2": "--ohm and --volts-per-unit would",
     "verdict noise.wav PATHS --rated-power 1 --rating sine": "--rating would not be used",
-    "verdict noise.wav PATHS --rated-power 1 --ohm 8 --loudspeaker-watt 5 --impedance rising.csv": "--ohm would not",
     "run --references 0 --errors 1 --rated-power 1 --file-fs 8000 --channel 0": "--file-fs and --channel would not",
 }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import os
 import re
@@ -139,54 +138,12 @@ def test_a_second_measurement_of_the_path_may_tell_how_well_it_is_known(command,
     assert json.loads(out)["limited_by"] is None  # the path is learned
 
 
-@pytest.mark.parametrize("option", ["--impedance", "--displacement"])
-def test_a_curve_is_a_local_file_that_is_not_unpacked(option, command, tmp_path):
-    (tmp_path / "x.csv.gz").write_bytes(gzip.compress(b"20,7\n80,40\n"))
-    rating = ["--ohm", "8", "--watt", "20", "--loudspeaker-watt", "1", "--x-max-mm", "2"]
-    other = [] if option == "--displacement" else ["--displacement", "falling.csv"]
-    for path, message in (
-        ("http://127.0.0.1:9/x.csv", "http://127.0.0.1:9/x.csv does not exist or is not a file"),
-        (tmp_path / "x.csv.gz", "is neither text nor of a kind that is read"),
-    ):
-        code, _, err = command("verdict", *SCENE, *rating, option, path, *other)
-        assert code == 2
-        assert message in err
-
-
-def test_a_loudspeakers_curves_are_read_from_files(command, folder):
-    (folder / "impedance.csv").write_text("20,7\n80,40\n300,6.4\n")
-    (folder / "displacement.csv").write_text("20,0.5\n4000,0.5\n")
-    rating = ["--watt", "100", "--ohm", "8", "--loudspeaker-watt", "1", "--impedance", "impedance.csv"]
-    options = ["--taps", "32", "--json", "--algorithm", "KF-PB"]
-    code, out, _ = command("verdict", *SCENE, *rating, *options)
-    assert code == 0
-    assert json.loads(out)["rating"]["rated_power"] == pytest.approx(6.4)
-    excursion = ["--x-max-mm", "0.1", "--displacement", "displacement.csv"]
-    code, out, _ = command("verdict", *SCENE, *rating, *excursion, *options)
-    assert code == 1
-    data = json.loads(out)
-    assert data["rating"]["decided_by"] == "loudspeaker's excursion"
-    assert data["rating"]["rated_power"] == pytest.approx((0.1 / 2 / 0.5) ** 2, rel=0.01)  # a response without colour
-    (folder / "words.csv").write_text("Hz,mm\n")
-    code, _, err = command("verdict", *SCENE, *rating, "--x-max-mm", "1", "--displacement", "words.csv")
-    assert code == 2
-    assert "words.csv is text that is no numbers" in err
-
-
-@pytest.mark.parametrize(
-    "curve",
-    [
-        "* Hz Ohms Deg\n20.5 7.1 17.3\n80 40 5\n300 6.4 1.5\n",  # .zma
-        "Hz,ohm\n20,7\n80,40\n300,6.4\n",
-        "Hz;Ohm\n20,5;7,1\n80;40\n300;6,4\n",
-        "20\t7\n80\t40\n300\t6.4\n",
-    ],
-)
-def test_a_curve_has_frequencies_and_values_in_its_first_columns(command, folder, curve):
-    (folder / "curve.zma").write_text(curve)
-    rating = ["--watt", 100, "--ohm", 8, "--loudspeaker-watt", 1, "--impedance", "curve.zma"]
+def test_the_rating_of_a_loudspeaker_counts_beside_that_of_the_amplifier(command):
+    rating = ["--watt", 100, "--ohm", 8, "--loudspeaker-watt", 0.8]
     out = command("verdict", *SCENE, *rating, "--taps", 16, "--json", "--algorithm", "FxLMS")[1]
-    assert json.loads(out)["rating"]["rated_power"] == pytest.approx(6.4)
+    found = json.loads(out)["rating"]
+    assert found["rated_power"] == pytest.approx(6.4)
+    assert found["decided_by"] == "loudspeaker's power"
 
 
 def test_channels_and_variables_are_named_with_their_files(command, folder):

@@ -15,7 +15,7 @@ import pytest
 from scipy.signal import firwin, welch
 
 from kfopc_filterpy import Plant, __version__
-from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
+from kfopc_filterpy.power import AmplifierRating
 from kfopc_filterpy.signals import Recording, band_limited_noise
 from kfopc_filterpy.verdict import assess
 from kfopc_filterpy.verdict.assessment import CAUSES, SCHEMA, advice_on
@@ -190,25 +190,6 @@ def test_the_advice_on_causality_is_a_delay_that_helps():
     helped = on(noise(high=3500.0), arriving(2 + more), arriving(12, length=16))
     assert helped.ceilings.filter_db >= verdict.want_db
     assert verdict.causality_margin_s == pytest.approx(-10 / FS)
-
-
-def test_an_excursion_limit_lowers_the_rated_power_until_it_is_kept():
-    curve = (np.array([100.0, 300.0, 1500.0]), np.array([2.0, 1.0, 0.05]))
-
-    def with_excursion(x_max: float):
-        loudspeaker = LoudspeakerRating(8.0, x_max_mm=x_max, displacement_mm_per_volt=curve)
-        return on(rating=[AmplifierRating(ohm=8.0, sine_watt=0.1), loudspeaker]), loudspeaker
-
-    verdict, loudspeaker = with_excursion(0.5)
-    assert verdict.limits.decided_by == "loudspeaker's excursion"
-    assert verdict.limits.rated_power < 0.8
-    y = verdict.runs["KF-PB"].control_signal
-    moved = loudspeaker.displacement_mm(y[y.size // 2 :], FS)
-    assert np.sqrt(np.mean(moved**2)) <= 0.5 / 2.0 * 1.02
-    assert verdict.excursion_mm > 0
-    free, _ = with_excursion(50.0)
-    assert free.limits.decided_by == "amplifier"
-    assert free.limits.rated_power == pytest.approx(0.8)
 
 
 # What it writes.

@@ -194,19 +194,6 @@ def test_kf_opc_is_left_out_of_large_systems_unless_it_is_asked_for():
     assert "KF-OPC" in on(n_taps=130, beside=("KF-OPC",), want_db=0.0).runs
 
 
-def test_an_excursion_limits_the_loudspeaker_that_has_one():
-    curve = (np.array([100.0, 300.0, 1500.0]), np.array([2.0, 1.0, 0.05]))
-    amplifier = AmplifierRating(ohm=8.0, sine_watt=0.1, volts_per_unit=1.0)
-    loudspeaker = LoudspeakerRating(8.0, x_max_mm=0.5, volts_per_unit=1.0, displacement_mm_per_volt=curve)
-    verdict = on(rating=[[amplifier, loudspeaker], amplifier])
-    assert verdict.limits.decided_by == ("loudspeaker's excursion", "amplifier")
-    assert verdict.limits.rated_power[0] < 0.8 == pytest.approx(verdict.limits.rated_power[1])
-    moved = loudspeaker.displacement_mm(verdict.runs["KF-PB"].control_signal[0, -8000:], FS)
-    assert np.sqrt(np.mean(moved**2)) <= 0.5 / 2.0 * 1.02
-    assert verdict.excursion_mm > 0
-    assert "W into 8 ohm" in verdict.verdict
-
-
 # ---- What it writes
 
 
