@@ -5,20 +5,22 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
 from kfopc_filterpy._writing import prepare_folder
 
 from .bench import Runs, StudyReport, results_table, write_report
+from .studies import duct
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
 
 
-def _study(module: str, main: str = "main") -> Study:
-    """Return a function of a study's module that runs it, and the one that counts its runs."""
+def _study(module: str) -> Study:
+    """Return the function of a study's module that runs it, and the one that counts its runs."""
     own = import_module(f".studies.{module}", __package__)
-    return getattr(own, main), own.planned_runs
+    return own.main, own.planned_runs
 
 
 ALONE = {  # with options of their own
@@ -28,10 +30,11 @@ ALONE = {  # with options of their own
     "data": ".bench.measured",
 }
 STUDIES = {name: _study(name) for name in ("tonal", "broadband", "duct")}
-STUDIES["duct-measured"] = _study("duct", "main_measured")
+MEASURED: dict[str, Study] = {name: (partial(duct.measured, name=name), duct.planned_runs) for name in duct.MEASURED}
+STUDIES["duct-measured"] = MEASURED.pop("duct-measured")
 BEYOND_THE_PAPER = ["constraint", "kf_pb", "loss_map", "rated_powers", "mismatch", "uncertain_path", "tracking"]
 BEYOND_THE_PAPER += ["amplifier", "multichannel"]
-FURTHER = {"duct-motor": _study("duct", "main_motor"), **{name: _study(name) for name in BEYOND_THE_PAPER}}
+FURTHER = MEASURED | {name: _study(name) for name in BEYOND_THE_PAPER}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,9 @@ FS = 16000.0  # of all of them
 
 # GitHub repository, commit and folder of each kind of file.
 SOURCES = {
+    # J. Ji, the first author of the KF-OPC paper: "a noise air duct", eight days before the preprint. No source says that
+    # it is the duct of the paper. Its secondary path has unit gain for white noise.
+    "author": "Ji-Junwei/PriPathEst_MOVFxLMS_ANC/84bcdae3aaba5c7410898dcb20ba14f5d417c0d8/MOVFxLMS_PriEst",
     # Z. Luo et al., "GFANC-Kalman: generative fixed-filter active noise control with CNN-Kalman filtering", IEEE Signal
     # Process. Lett., 2023. The units are arbitrary: the secondary path gains 10 to 30 dB.
     "duct": "Luo-Zhengding/GFANC-Kalman/06badd525411571402e83212e7f00b2345cde62d/Pz and Sz/Duct_Path",
@@ -39,6 +43,7 @@ SOURCES = {
     "room4x4": "ShiDongyuan/Meta/dd99aaa351c397090ab7efc03f02a84b669cf302/path",
 }
 SHA256 = {
+    "author/Path.mat": "6e2cd0821fec5e1d15258280399315ad20d44f09006789de50f3611d837b7c8c",
     "duct/Pz1.mat": "21933650a3af9a1e0cdf77b36d04c03ca36494d9b33384cbc004bbd7e51f976d",
     "duct/Sz.mat": "ea6fcee9df766cf361438f73de5fb63590c20562440a88c462f882fa159df176",
     "motor/Motor.mat": "bded8c35cec69f2c2a71f7d75f8248382a2ea80698ded835d9914b0363755dde",
@@ -64,6 +69,12 @@ SHA256 = {
     "room4x4/S43.mat": "ee087943f71e14ecebbae62db8db1ed33f74de799ed38ff3b2fd2fefad16aea5",
     "room4x4/S44.mat": "e9a9abe5d954d98933e13c0b933a3487bb54fcf7e2826a25b2b259a1fa01576c",
 }
+# Files and variables of each measured duct's primary and secondary path, and of each noise.
+DUCTS = {
+    "author": (("author/Path.mat", "P"), ("author/Path.mat", "S")),
+    "gfanc": (("duct/Pz1.mat", "Pz1"), ("duct/Sz.mat", "S")),
+}
+NOISES = {"motor": ("motor/Motor.mat", "Motor_noise"), "compressor": ("compressor/compressor_16kHz.mat", "yr")}
 
 
 class DataUnavailableError(FileNotFoundError):
@@ -80,10 +91,13 @@ class MeasuredDuct:
     fs: float = FS
 
 
-def load_measured_duct(noise: str) -> MeasuredDuct:
-    """Return the measured duct, and the recording of the "motor" (10.1 s) or of the "compressor" (17.5 s)."""
-    file, variable = {"motor": ("Motor.mat", "Motor_noise"), "compressor": ("compressor_16kHz.mat", "yr")}[noise]
-    return MeasuredDuct(_read("duct/Pz1.mat", "Pz1"), _read("duct/Sz.mat", "S"), _read(f"{noise}/{file}", variable))
+def load_measured_duct(noise: str, duct: str = "gfanc") -> MeasuredDuct:
+    """Return a measured duct, and the recording of the "motor" (10.1 s) or of the "compressor" (17.5 s).
+
+    The duct is that of the paper's first author, "author", or that of Luo et al., "gfanc".
+    """
+    primary, secondary = (_read(*place) for place in DUCTS[duct])
+    return MeasuredDuct(primary, secondary, _read(*NOISES[noise]))
 
 
 def load_measured_room() -> Plant:
@@ -106,7 +120,8 @@ def fetch(name: str) -> Path:
     urls = {file: f"{HOST}/{quote(SOURCES[Path(file).parent.name])}/{Path(file).name}" for file in SHA256}
     store = pooch.create(folder(), base_url="", registry=SHA256, urls=urls, allow_updates=False)
     try:
-        return Path(store.fetch(name, downloader=pooch.HTTPDownloader(timeout=TIMEOUT_S)))
+        downloader = pooch.HTTPDownloader(timeout=TIMEOUT_S, progressbar=sys.stderr.isatty())
+        return Path(store.fetch(name, downloader=downloader))
     # No network, an answer such as 404, a cut transfer and a folder that cannot be written are OSErrors; a hash that is
     # not the published file's is a ValueError.
     except (OSError, ValueError) as error:

@@ -31,22 +31,23 @@ def test_pinned_hashes_are_those_of_the_published_files(shared_data: Path) -> No
         assert hashlib.sha256((shared_data / name).read_bytes()).hexdigest() == SHA256[name]
 
 
-@pytest.mark.parametrize(
-    ("noise", "file", "variable"),
-    [("motor", "Motor.mat", "Motor_noise"), ("compressor", "compressor_16kHz.mat", "yr")],
-)
-def test_published_duct_has_its_known_contents(
-    shared_data: Path, data_folder: Any, noise: str, file: str, variable: str
-) -> None:
+@pytest.mark.parametrize("noise", measured.NOISES)
+def test_published_ducts_have_their_known_contents(shared_data: Path, data_folder: Any, noise: str) -> None:
     data_folder(shared_data)
-    duct = load_measured_duct(noise)
+    duct, author = load_measured_duct(noise), load_measured_duct(noise, "author")
     assert (duct.primary.shape, duct.secondary.shape, duct.fs) == ((1024,), (512,), 16000)
-    for name, key, found in (
-        ("duct/Pz1.mat", "Pz1", duct.primary),
-        ("duct/Sz.mat", "S", duct.secondary),
-        (f"{noise}/{file}", variable, duct.noise),
+    assert (author.primary.shape, author.secondary.shape, author.fs) == ((800,), (800,), 16000)
+    for (name, key), found in (
+        *zip(measured.DUCTS["gfanc"], (duct.primary, duct.secondary), strict=True),
+        *zip(measured.DUCTS["author"], (author.primary, author.secondary), strict=True),
+        (measured.NOISES[noise], duct.noise),
+        (measured.NOISES[noise], author.noise),
     ):
         np.testing.assert_array_equal(found, scipy.io.loadmat(shared_data / name)[key][:, 0])
+    # The first author's paths have unit energy, and the noise arrives 23 samples after the loudspeaker's sound.
+    assert np.sum(author.primary**2) == pytest.approx(1.0)
+    assert np.sum(author.secondary**2) == pytest.approx(1.0)
+    assert (np.argmax(np.abs(author.secondary)), np.argmax(np.abs(author.primary))) == (12, 35)
     # The secondary path gains 10 to 30 dB in the middle of 200 to 2000 Hz.
     gain_db = 20 * np.log10(np.abs(np.fft.rfft(duct.secondary, 4096)))[52:513]
     assert 10 < np.median(gain_db) < 30
@@ -99,6 +100,7 @@ def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Source]:
     """A server of small files in place of the published ones: S{k}{j} holds k and j. The cache is a new folder."""
     contents = {"duct/Pz1": "Pz1", "duct/Sz": "S", "motor/Motor": "Motor_noise", "compressor/compressor_16kHz": "yr"}
     files = {f"{name}.mat": {key: [[1.0], [2.0], [3.0]]} for name, key in contents.items()}
+    files["author/Path.mat"] = {"P": [[4.0], [5.0]], "S": [[6.0], [7.0]]}
     for name in (*(f"P{k}" for k in EACH), *(f"S{k}{j}" for k in EACH for j in EACH)):
         files[f"room4x4/{name}.mat"] = {name: [[float(digit)] for digit in f"{name[1:]:0<6}"]}  # six taps
     assert files.keys() == SHA256.keys()
@@ -128,11 +130,14 @@ def test_without_a_folder_each_file_is_fetched_once_to_the_cache(source: Source,
     for _ in range(2):
         duct = load_measured_duct("motor")
         assert [duct.primary.tolist(), duct.secondary.tolist(), duct.noise.tolist()] == 3 * [[1.0, 2.0, 3.0]]
-    assert [Path(path).name for path in source.asked] == ["Pz1.mat", "Sz.mat", "Motor.mat"]
-    for path, repository in zip(source.asked, ["Luo-Zhengding", "Luo-Zhengding", "Ji-Junwei"], strict=True):
+        author = load_measured_duct("motor", "author")
+        assert [author.primary.tolist(), author.secondary.tolist()] == [[4.0, 5.0], [6.0, 7.0]]
+    assert [Path(path).name for path in source.asked] == ["Pz1.mat", "Sz.mat", "Motor.mat", "Path.mat"]
+    owners = ["Luo-Zhengding", "Luo-Zhengding", "Ji-Junwei", "Ji-Junwei"]
+    for path, repository in zip(source.asked, owners, strict=True):
         assert path.startswith(f"/{repository}/")
         assert " " not in path
-    assert left_in(tmp_path / "cache" / "kfopc_filterpy") == ["Motor.mat", "Pz1.mat", "Sz.mat"]
+    assert left_in(tmp_path / "cache" / "kfopc_filterpy") == ["Motor.mat", "Path.mat", "Pz1.mat", "Sz.mat"]
 
 
 def test_first_index_of_the_room_is_the_microphone_and_second_the_loudspeaker(source: Source) -> None:

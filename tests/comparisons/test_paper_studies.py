@@ -208,20 +208,27 @@ def test_the_common_level_is_that_of_the_lesser(scene: Any) -> None:
 # ---- Which noise
 
 
-@pytest.mark.parametrize(("name", "noise"), [("duct-measured", "compressor"), ("duct-motor", "motor")])
-def test_each_study_asks_for_its_recording(name: str, noise: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "noise", "owner"),
+    [
+        ("duct-measured", "compressor", "author"),
+        ("duct-second", "compressor", "gfanc"),
+        ("duct-motor", "motor", "gfanc"),
+    ],
+)
+def test_each_study_asks_for_its_duct_and_recording(name: str, noise: str, owner: str) -> None:
     main, _ = (STUDIES | FURTHER)[name]
     asked = []
 
-    def unavailable(noise: str) -> None:
-        asked.append(noise)
+    def unavailable(*what: str) -> None:
+        asked.append(what)
         raise duct.DataUnavailableError("no file")
 
     with smaller(duct, load_measured_duct=unavailable):
         line = main(Runs())
     assert line.startswith(f"{name} is left out: set KFOPC_DATA to a folder with the measured data")
     assert line.endswith("(no file)")
-    assert asked == [noise]
+    assert asked == [(noise, owner)]
 
 
 def test_figures_are_over_the_rated_power(scene: Any) -> None:
