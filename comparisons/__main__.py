@@ -17,10 +17,10 @@ from .studies import duct
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
 
 
-def _study(module: str) -> Study:
-    """Return the function of a study's module that runs it, and the one that counts its runs."""
+def _study(module: str, main: str = "main") -> Study:
+    """Return a function of a study's module that runs it, and the one that counts its runs."""
     own = import_module(f".studies.{module}", __package__)
-    return own.main, own.planned_runs
+    return getattr(own, main), own.planned_runs
 
 
 ALONE = {  # with options of their own
@@ -32,9 +32,10 @@ ALONE = {  # with options of their own
 STUDIES = {name: _study(name) for name in ("tonal", "broadband", "duct")}
 MEASURED: dict[str, Study] = {name: (partial(duct.measured, name=name), duct.planned_runs) for name in duct.MEASURED}
 STUDIES["duct-measured"] = MEASURED.pop("duct-measured")
-BEYOND_THE_PAPER = ["constraint", "kf_pb", "loss_map", "rated_powers", "mismatch", "uncertain_path", "tracking"]
+BEYOND_THE_PAPER = ["ways", "constraint", "kf_pb", "loss_map", "rated_powers", "mismatch", "uncertain_path", "tracking"]
 BEYOND_THE_PAPER += ["amplifier", "multichannel"]
-FURTHER = MEASURED | {name: _study(name) for name in BEYOND_THE_PAPER}
+FURTHER = {f"{name}-authors": _study(name, "authors") for name in ("tonal", "broadband")} | MEASURED
+FURTHER |= {name: _study(name) for name in BEYOND_THE_PAPER}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -186,7 +186,7 @@ def _constrained(settings: Settings) -> Settings:
 
     def constrained(scene: Scene, first: float, second: float) -> dict[str, Any]:
         each = [
-            OutputPowerConstraint(power, fs=scene.fs, memory_s=scene.power_memory_s)
+            OutputPowerConstraint(power, fs=scene.fs, memory_s=scene.power_memory_s, window=scene.power_window)
             for power in np.ravel(scene.rated_power)
         ]
         return settings(scene, first, second) | {"constraint": each if np.ndim(scene.rated_power) else each[0]}

@@ -122,6 +122,8 @@ class Scene:
         Amplifier that disturbance estimates know; by default they take it to be linear.
     power_memory_s : float, default 0.5
         Memory in seconds of the power estimates of the constrained algorithms.
+    power_window : {"exponential", "sliding"}, default "exponential"
+        Window of these estimates.
     clips_at : float or ndarray, shape (J,), optional
         Limit of the amplifiers, if it is not the peak of a sine at rated power.
     """
@@ -145,6 +147,7 @@ class Scene:
     secondary_path_uncertainty: Any = None
     known_amplifier: Amplifier | Sequence[Amplifier] | None = None
     power_memory_s: float = 0.5
+    power_window: str = "exponential"
     clips_at: Any = None
 
     @property
@@ -216,7 +219,7 @@ def make_scene(
     plant: Plant,
     *,
     rated_power: float,
-    power_multiple: float,
+    power_multiple: float | None,
     n_taps: int,
     switch_on_s: float = 0.5,
     sensor_noise_db: float = -60.0,
@@ -238,8 +241,9 @@ def make_scene(
         Plant with a primary path; its sensor noise is replaced by that of `sensor_noise_db`.
     rated_power : float or ndarray, shape (J,)
         Rated output power, a mean square; of all loudspeakers or of each.
-    power_multiple : float
-        Unconstrained control power over the rated power, each summed over the loudspeakers.
+    power_multiple : float or None
+        Unconstrained control power over the rated power, each summed over the loudspeakers; None leaves the noises as
+        loud as they are.
     n_taps : int
         Taps of the control filter.
     switch_on_s : float, default 0.5
@@ -276,7 +280,9 @@ def make_scene(
     rated_power = _as_rating(rated_power, plant if several else None)
     settled = (..., slice(int(switch_on_s * plant.fs), None))  # after the start-up of the primary path
     wiener = reachable_solution(first[settled], plant.disturbance(first)[settled], plant, n_taps)
-    asked = power_multiple * np.sum(rated_power * np.ones(np.shape(wiener.control_power)))
+    asked = np.sum(wiener.control_power)
+    if power_multiple is not None:
+        asked = power_multiple * np.sum(rated_power * np.ones(np.shape(wiener.control_power)))
     share = wiener.control_power / np.sum(wiener.control_power)
     power = _power(first) * asked / np.sum(wiener.control_power)
     scaled = [np.sqrt(power / _power(x)) * x for x in signals.values()]

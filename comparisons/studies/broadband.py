@@ -18,7 +18,7 @@ from .. import bench
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, figures_of_merit
 from . import report_parts as parts
 from .broadband_clipped import clipped_claims, run_clipped, starts, starts_table
-from .cases import FS, PAPER, Results, bandpass_plant, grid_runs, run_seeds
+from .cases import AUTHORS, CHOSEN, FS, PAPER, Results, Setup, grid_runs
 from .report_parts import milliseconds
 from .weight_errors import WEIGHTS_EVERY, draw_weight_errors, first_below_s, settled_after_s, weight_error
 
@@ -26,9 +26,6 @@ BAND = (200.0, 2000.0)
 DURATION_S = 10.5
 RATED_POWER = 0.8
 POWER_MULTIPLE = 4.0
-N_TAPS = 128
-OTHER_N_TAPS = 256
-CONSTRAINED = ("KF-OPC", "MOV-FxLMS")
 SEEDS = tuple(range(1, 9))
 TUNING_SEEDS = 2
 
@@ -43,13 +40,22 @@ COHERENT = 0.99
 
 def planned_runs() -> int:
     """Return the number of runs of the study."""
-    tuning = TUNING_SEEDS * grid_runs(PAPER) + grid_runs(CONSTRAINED)
-    return tuning + len(SEEDS) * (2 * len(PAPER) + 2 + len(CONSTRAINED))
+    return TUNING_SEEDS * grid_runs(PAPER) + len(SEEDS) * (2 * len(PAPER) + 2)
 
 
 def main(runs: Runs) -> StudyReport:
     """Run the study."""
-    scene = _scene(N_TAPS)
+    return _study(runs, "broadband", CHOSEN)
+
+
+def authors(runs: Runs) -> StudyReport:
+    """Run the study with the settings of the authors' code."""
+    return _study(runs, "broadband-authors", AUTHORS)
+
+
+def _study(runs: Runs, name: str, setup: Setup) -> StudyReport:
+    noises = {seed: band_limited_noise(BAND, DURATION_S, fs=FS, rng=seed) for seed in SEEDS}
+    scene = setup.scene(noises, setup.plant(), rated_power=RATED_POWER, power_multiple=POWER_MULTIPLE)
     tuned = bench.tune(runs, scene, seeds=TUNING_SEEDS)
     results, weight_errors = _run_recorded(runs, scene, tuned)
     merits: dict[str, dict[str, Any]] = {name: figures_of_merit(rows, scene) for name, rows in results.items()}
@@ -58,7 +64,6 @@ def main(runs: Runs) -> StudyReport:
     clipped_scene = bench.with_clipping(scene)
     clipped = run_clipped(runs, scene, clipped_scene, tuned)
     clipped_figures = {name: figures_of_merit(rows, clipped_scene) | starts(rows) for name, rows in clipped.items()}
-    other = _other_length(runs)
     powers = {name: [r.output_power for r in rows] for name, rows in results.items()}
     first = results["KF-OPC"][0]
     coherence = coherence_and_gain(first.disturbance, first.anti_noise, FS, BAND)
@@ -67,7 +72,7 @@ def main(runs: Runs) -> StudyReport:
     return parts.report_of_paper(
         scene,
         tuned,
-        name="broadband",
+        name=name,
         title="Broadband noise and a linear amplifier",
         summary=(
             f"Noise from {BAND[0]:g} to {BAND[1]:g} Hz needs {POWER_MULTIPLE:g} times the rated power of {RATED_POWER:g}. "
@@ -83,7 +88,7 @@ def main(runs: Runs) -> StudyReport:
                 "the q above, and what no filter explains of what the amplifier clips off the best signal of rated power",
             ),
         }
-        | parts.BANDPASS_PATHS,
+        | parts.bandpass_parameters(setup),
         algorithms=merits,
         extra={
             "output_power_of_each_seed": powers,
@@ -92,7 +97,6 @@ def main(runs: Runs) -> StudyReport:
             "weight_error_below_20_db_after_s": settling,
             "weight_error_first_below_20_db_after_s": reached,
             "with_clipping_amplifier": clipped_figures,
-            f"convergence_time_s_at_{OTHER_N_TAPS}_taps": other,
         },
         claims=[
             *claims(
@@ -107,13 +111,6 @@ def main(runs: Runs) -> StudyReport:
         tables=[starts_table(clipped_figures), _settling_table(settling, reached, times)],
         figures=_figures_of(results, weight_errors, clipped, clipped_scene),
         sounds=parts.sounds({name: rows[0] for name, rows in results.items()}),
-    )
-
-
-def _scene(n_taps: int) -> Scene:
-    noises = {seed: band_limited_noise(BAND, DURATION_S, fs=FS, rng=seed) for seed in SEEDS}
-    return bench.make_scene(
-        noises, bandpass_plant(), rated_power=RATED_POWER, power_multiple=POWER_MULTIPLE, n_taps=n_taps
     )
 
 
@@ -141,13 +138,6 @@ def _run_recorded(runs: Runs, scene: Scene, tuned: Mapping[str, Tuned]) -> tuple
         {name: [result for result, _ in own] for name, own in of.items()},
         {name: np.mean([error for _, error in own], axis=0) for name, own in of.items()},
     )
-
-
-def _other_length(runs: Runs) -> dict[str, float | None]:
-    """Return the convergence times of the constrained methods with another length, tuned again on the first seed."""
-    scene = _scene(OTHER_N_TAPS)
-    results = run_seeds(runs, scene, bench.tune(runs, scene, CONSTRAINED))
-    return {name: figures_of_merit(rows, scene)["convergence_time_s"] for name, rows in results.items()}
 
 
 # ---- Claims, of plain figures

@@ -62,17 +62,39 @@ class Case:
         return f"{self.path}, {self.noise}"
 
 
+@dataclass(frozen=True)
+class Setup:
+    """What the paper leaves open: the rule's choice, or what its authors' published code has."""
+
+    n_taps: int
+    band_hz: tuple[float, float]  # of the band-pass paths
+    primary_taps: int
+    secondary_taps: int
+    memory_s: float  # of the power estimates
+    window: str
+    source: str
+
+    def plant(self, **options: Any) -> Plant:
+        """Return the plant of the band-pass paths."""
+        secondary, primary = (bandpass_path(n, self.band_hz, fs=FS) for n in (self.secondary_taps, self.primary_taps))
+        return Plant(secondary, primary, **options)
+
+    def scene(self, references: Mapping[int, np.ndarray], plant: Plant, **levels: Any) -> Scene:
+        """Return a scene with these taps and power estimates."""
+        scene = make_scene(references, plant, n_taps=self.n_taps, **levels)
+        return replace(scene, power_memory_s=self.memory_s, power_window=self.window)
+
+
+CHOSEN = Setup(128, (20.0, 5000.0), 128, 32, 0.5, "exponential", "the paper's")
+AUTHORS = Setup(256, (80.0, 5000.0), 256, 128, 1024 / FS, "sliding", "those of the authors' code")
+
+
 # ---- Plants and noises
-
-
-def bandpass_plant() -> Plant:
-    """Return the paper's band-pass paths, of 128 and 32 taps."""
-    return Plant(bandpass_path(32, fs=FS), bandpass_path(128, fs=FS))
 
 
 def modelled_plants() -> dict[str, Plant]:
     """Return the models by name."""
-    return {"band-pass": bandpass_plant(), "duct": duct_plant(fs=FS)}
+    return {"band-pass": CHOSEN.plant(), "duct": duct_plant(fs=FS)}
 
 
 def plants() -> dict[str, Plant]:

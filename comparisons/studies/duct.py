@@ -18,9 +18,9 @@ from kfopc_filterpy.signals import compressor_noise
 
 from .. import bench
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table
-from ..bench.measured import DataUnavailableError, load_measured_duct
+from ..bench.measured import DataUnavailableError, MeasuredDuct, load_measured_duct
 from . import report_parts as parts
-from .cases import FS, PAPER, SEED, grid_runs, of_unit_gain, run_each
+from .cases import AUTHORS, CHOSEN, FS, PAPER, SEED, grid_runs, of_unit_gain, run_each
 from .duct_start import Start, faster_claims, start_table, start_under_constraint
 
 DURATION_S = 10.5
@@ -31,7 +31,6 @@ NSE_WINDOW_S = 0.05
 FIXED = "MOV-FxLMS by variance"
 ALGORITHMS = (*PAPER, FIXED, "KF-PB")
 RATED = ("KF-OPC", "KF-PB", "MOV-FxLMS", FIXED)  # those with a rated power
-OTHER_MULTIPLE = 10.0  # a rated power of 10 % of what the noise needs, beside the one of 25 %
 
 # What the claims call keeping the rated power, over the steady half and over the worst second, and disregarding it.
 KEPT, KEPT_OVER_1_S, DISREGARDED = 1.02, 1.1, 1.5
@@ -43,6 +42,11 @@ MEASURED = {  # duct, noise, and whether they are the paper's
         "compressor",
         "duct and noise are probably the paper's, because its first author published both, the duct eight days before the "
         "preprint; no source says so",
+    ),
+    "duct-authors": (
+        "author",
+        "compressor",
+        "the same with the levels and the power estimates of the authors' code",
     ),
     "duct-second": ("gfanc", "compressor", "published by the paper's first author; the duct is of other authors"),
     "duct-motor": ("gfanc", "motor", "a noise whose level varies; not the paper's"),
@@ -62,7 +66,7 @@ class Figures:
 
 def planned_runs() -> int:
     """Return the number of runs of the study, of either duct."""
-    return grid_runs(ALGORITHMS) + len(ALGORITHMS) + len(RATED)
+    return grid_runs(ALGORITHMS) + len(ALGORITHMS)
 
 
 def main(runs: Runs) -> StudyReport:
@@ -77,46 +81,48 @@ def main(runs: Runs) -> StudyReport:
     return _study(runs, "duct", "Machine noise in a modelled duct", noise, duct_plant(duct, fs=FS), parameters)
 
 
-def measured(runs: Runs, name: str) -> StudyReport | str:
-    """Run the study with a measured duct and a recorded noise; without them return a line that says why."""
-    duct, noise, remark = MEASURED[name]
+def at_hand(study: str, name: str) -> MeasuredDuct | str:
+    """Return the duct and noise of a study with a measured duct, or a line that says why another study is left out."""
+    duct, noise, _ = MEASURED[name]
     try:
-        data = load_measured_duct(noise, duct)
+        return load_measured_duct(noise, duct)
     except DataUnavailableError as error:
         return (
-            f"{name} is left out: set KFOPC_DATA to a folder with the measured data, or run again with a network "
+            f"{study} is left out: set KFOPC_DATA to a folder with the measured data, or run again with a network "
             f"({shorten(str(error), 120, placeholder=' ...')})"
         )
-    taps, owner = data.primary.size, OWNERS[duct]
+
+
+def measured(runs: Runs, name: str) -> StudyReport | str:
+    """Run the study with a measured duct and a recorded noise; without them return a line that says why."""
+    data = at_hand(name, name)
+    if isinstance(data, str):
+        return data
+    duct, noise, remark = MEASURED[name]
+    owner = OWNERS[duct]
     parameters = {
         "noise": Parameter(f"recorded {noise} noise, mean removed", remark),
-        "primary_path": Parameter(f"duct of {owner}, {taps} taps", "as published, scale arbitrary"),
+        "primary_path": Parameter(f"duct of {owner}, {data.primary.size} taps", "as published, scale arbitrary"),
         "secondary_path": Parameter("of the same duct", "scaled to unit gain for white noise"),
     }
     title = f"Recorded {noise} noise in the duct of {owner}"
     return _study(runs, name, title, data.noise - data.noise.mean(), of_unit_gain(data), parameters)
 
 
+def scene_of(noise: np.ndarray, plant: Plant, *, as_authors: bool = False) -> Scene:
+    """Return the scene of a noise in a duct, which takes the multiple of the rated power, or has their unit variance."""
+    setup, multiple = (AUTHORS, None) if as_authors else (replace(CHOSEN, n_taps=N_TAPS), POWER_MULTIPLE)
+    levels: dict[str, Any] = {"rated_power": RATED_POWER, "power_multiple": multiple, "nse_window_s": NSE_WINDOW_S}
+    return setup.scene({SEED: noise / np.std(noise)}, plant, **levels)
+
+
 def _study(
     runs: Runs, name: str, title: str, noise: np.ndarray, plant: Plant, parameters: dict[str, Parameter]
 ) -> StudyReport:
-    scene = bench.make_scene(
-        {SEED: noise},
-        plant,
-        rated_power=RATED_POWER,
-        power_multiple=POWER_MULTIPLE,
-        n_taps=N_TAPS,
-        nse_window_s=NSE_WINDOW_S,
-    )
+    scene = scene_of(noise, plant, as_authors=name == "duct-authors")
     tuned = bench.tune(runs, scene, ALGORITHMS)
-    smaller = replace(scene, rated_power=scene.unconstrained_power / OTHER_MULTIPLE)
-
-    def run_all(at: Scene, names: Sequence[str]) -> dict[str, SimulationResult]:
-        return run_each(runs, at, {name: tuned[name].setting for name in names})
-
-    results, of_smaller = run_all(scene, ALGORITHMS), run_all(smaller, RATED)
+    results = run_each(runs, scene, {name: best.setting for name, best in tuned.items()})
     figures = {algorithm: figures_of(result, RATED_POWER) for algorithm, result in results.items()}
-    at_smaller = {algorithm: figures_of(result, smaller.rated_power) for algorithm, result in of_smaller.items()}
     start = start_under_constraint(scene, tuned, results["KF-OPC"].constraint_factor)
     x, d = scene.settled
     wiener = wiener_solution(x, plant, n_taps=N_TAPS, disturbance=d)
@@ -129,7 +135,7 @@ def _study(
         name=name,
         title=title,
         summary=(
-            f"The noise needs {POWER_MULTIPLE:g} times the rated power of {RATED_POWER:g}, which a linear amplifier puts out. "
+            f"The noise needs {scene.unconstrained_power / RATED_POWER:.3g} times the rated power of {RATED_POWER:g}, which a linear amplifier puts out. "
             f"The noise: {parameters['noise'].value} ({parameters['noise'].chosen})."
         ),
         parameters=parameters
@@ -143,12 +149,11 @@ def _study(
             "gain_of_the_wiener_control_signal": control_gain,
             "best_noise_reduction_within_the_power_db": bound.noise_reduction_db,
             "figures": {algorithm: asdict(own) for algorithm, own in figures.items()},
-            "figures_at_the_smaller_rated_power": {algorithm: asdict(own) for algorithm, own in at_smaller.items()},
             "start_under_constraint": None if start is None else asdict(start),
         },
         claims=claims(figures, start),
         tables=[
-            _rating_table({POWER_MULTIPLE: figures, OTHER_MULTIPLE: at_smaller}),
+            _rating_table(figures),
             Table(
                 "gains",
                 "Power gain of the secondary path, which eq. 11 takes from the reference, and the ceiling",
@@ -207,19 +212,12 @@ def claims(figures: Mapping[str, Figures], start: Start | None) -> list[Claim]:
 # ---- Table and figures
 
 
-def _rating_table(at: Mapping[float, Mapping[str, Figures]]) -> Table:
-    """Return what a rated power buys, by the multiple of it that the unconstrained filter needs."""
+def _rating_table(figures: Mapping[str, Figures]) -> Table:
     return Table(
-        "ratings",
-        "Two rated powers, in % of the power that the unconstrained filter needs. Powers are over the rated one. The settings "
-        "are those that are best at the first.",
-        ["rating (%)", "algorithm", "noise reduction dB", "mean NSE dB", "power", "worst second", "worst 50 ms"],
-        [
-            [100 / multiple, name, *astuple(own)]
-            for multiple, figures in at.items()
-            for name, own in figures.items()
-            if name in RATED
-        ],
+        "rated",
+        "The algorithms with a rated power; powers are over it",
+        ["algorithm", "noise reduction dB", "mean NSE dB", "power", "worst second", "worst 50 ms"],
+        [[name, *astuple(own)] for name, own in figures.items() if name in RATED],
     )
 
 

@@ -13,13 +13,9 @@ from kfopc_filterpy.bounds import power_constrained_solution
 from kfopc_filterpy.plot import curve_style, plot_bode
 
 from ..bench import FigureItem, Parameter, Scene, Sound, StudyReport, Trial, Tuned, algorithms
-from .cases import BAND_HZ, FS, N_TAPS, SEED, SENSOR_NOISE_DB, SWITCH_ON_S, TONE_HZ, bounds_db
+from .cases import BAND_HZ, FS, N_TAPS, SEED, SENSOR_NOISE_DB, SWITCH_ON_S, TONE_HZ, Setup, bounds_db
 
 MARK = "0.35"  # colour of reference lines
-BANDPASS_PATHS = {
-    "primary_path": Parameter("band-pass FIR, 20-5000 Hz, 128 taps", "the paper's; Hamming window"),
-    "secondary_path": Parameter("band-pass FIR, 20-5000 Hz, 32 taps", "the paper's; Hamming window"),
-}
 
 
 def report_of_rows(rows: Iterable[Any], **report: Any) -> StudyReport:
@@ -83,6 +79,13 @@ def legend_of(figure: Any, axes: Any) -> None:
 # ---- Parameters and notes
 
 
+def bandpass_parameters(setup: Setup) -> dict[str, Parameter]:
+    """Return the band-pass paths of the paper's first two studies."""
+    band = f"band-pass FIR, {setup.band_hz[0]:g}-{setup.band_hz[1]:g} Hz"
+    taps = {"primary_path": setup.primary_taps, "secondary_path": setup.secondary_taps}
+    return {name: Parameter(f"{band}, {n} taps", f"{setup.source}; Hamming window") for name, n in taps.items()}
+
+
 def ceiling_note(scene: Scene) -> str:
     """Return the ceiling of every constrained algorithm as a sentence."""
     x, d = scene.settled
@@ -99,7 +102,10 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
     parameters = {
         "fs_hz": Parameter(scene.fs, "the rate of the measured duct; the paper does not state its own"),
         "rated_power": Parameter(scene.rated_power, "the paper's"),
-        "n_taps": Parameter(scene.n_taps, "not stated in the paper; enough for the primary path's delay and length"),
+        "n_taps": Parameter(
+            scene.n_taps,
+            "not stated in the paper; enough for the primary path's delay and length, or as in its authors' code",
+        ),
         "wiener_control_power": Parameter(
             scene.unconstrained_power, "the reference is scaled to it: the constraint acts"
         ),
@@ -108,7 +114,7 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
         "sensor_noise_std": Parameter(scene.sensor_noise_std, "60 dB below the disturbance"),
         "measurement_noise_q": Parameter(scene.measurement_noise, "eq. 7: residual of a batch fit without control"),
         "initial_variance_P0": Parameter(scene.initial_variance, "Wiener control power over L times the reference's"),
-        "power_memory_s": Parameter(scene.power_memory_s, "exponential window; the package's default"),
+        "power_memory_s": Parameter(scene.power_memory_s, f"{scene.power_window} window"),
         "secondary_path_estimate": Parameter("exact", "the paper models no mismatch"),
         "switch_on_s": Parameter(scene.switch_on_s, "the noise runs before, and fills delay lines and powers"),
         "nse_window_s": Parameter(scene.nse_window_s, "5 ms; 50 ms if one random run would not settle at 5 ms"),

@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, Plant, SimulationResult, bandpass_path, plot
+from kfopc_filterpy import HardClipAmplifier, SimulationResult, plot
 from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.metrics import peak_control_signal
+from kfopc_filterpy.paths import fir_path
 from kfopc_filterpy.plot.style import labelled
 from kfopc_filterpy.signals import tone
 
 from .. import bench
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, algorithms
 from . import report_parts as parts
-from .cases import FS, PAPER, Setting, grid_runs, run_each
+from .cases import AUTHORS, CHOSEN, FS, PAPER, Setting, Setup, grid_runs, run_each
 from .weight_growth import Growth, growth_of
 
 KALMAN = ("KF-ANC", "KF-OPC")
@@ -26,7 +27,6 @@ DURATION_S = 10.5
 RATED_POWER = 1.0
 LIMIT = float(np.sqrt(2 * RATED_POWER))  # of the amplifier: the peak of a sine at rated power
 POWER_MULTIPLE = 2.0
-N_TAPS = 128
 OVERDRIVES_DB = np.arange(0.0, 10.5, 1.0)
 UNFORGETTING = 1e-10  # so little state noise that a filter hardly forgets in a run
 FORGETFUL = max(algorithms()["KF-ANC"].grid)  # most state noise of the grid: the fastest forgetting
@@ -45,10 +45,19 @@ def planned_runs() -> int:
 
 def main(runs: Runs) -> StudyReport:
     """Run the study."""
-    primary, secondary = bandpass_path(128, fs=FS), bandpass_path(32, fs=FS)
-    plant = Plant(secondary, primary, amplifier=HardClipAmplifier(LIMIT))
+    return _study(runs, "tonal", CHOSEN)
+
+
+def authors(runs: Runs) -> StudyReport:
+    """Run the study with the settings of the authors' code; their tone has an amplitude of 2, as here to 1 %."""
+    return _study(runs, "tonal-authors", AUTHORS)
+
+
+def _study(runs: Runs, name: str, setup: Setup) -> StudyReport:
+    plant = setup.plant(amplifier=HardClipAmplifier(LIMIT))
+    assert plant.primary is not None
     x = tone(TONE_HZ, DURATION_S, fs=FS)
-    scene = bench.make_scene({0: x}, plant, rated_power=RATED_POWER, power_multiple=POWER_MULTIPLE, n_taps=N_TAPS)
+    scene = setup.scene({0: x}, plant, rated_power=RATED_POWER, power_multiple=POWER_MULTIPLE)
     tuned = bench.tune(runs, scene)
 
     def run_all(settings: Mapping[str, Setting]) -> dict[str, SimulationResult]:
@@ -58,7 +67,7 @@ def main(runs: Runs) -> StudyReport:
     forgetful, unforgetting = (run_all(dict.fromkeys(KALMAN, setting)) for setting in (FORGETFUL, UNFORGETTING))
     merits = {name: bench.figures_of_merit([result], scene, tone_hz=TONE_HZ) for name, result in results.items()}
     x, d = scene.settled
-    optimal_weight = float(np.abs(wiener_solution(x, scene.plant, n_taps=N_TAPS, disturbance=d).weights).max())
+    optimal_weight = float(np.abs(wiener_solution(x, scene.plant, n_taps=scene.n_taps, disturbance=d).weights).max())
     pairs = {tuned["KF-ANC"].setting: results, FORGETFUL: forgetful}
     growths = {setting: [growth_of(pair[name], optimal_weight) for name in KALMAN] for setting, pair in pairs.items()}
     sweep = _overdrive_sweep(runs, scene, tuned)
@@ -66,7 +75,7 @@ def main(runs: Runs) -> StudyReport:
     return parts.report_of_paper(
         scene,
         tuned,
-        name="tonal",
+        name=name,
         title="Tonal noise and a clipping amplifier",
         summary=(
             f"A {TONE_HZ:g} Hz tone needs {POWER_MULTIPLE:g} times the rated power. The amplifier clips at "
@@ -78,7 +87,7 @@ def main(runs: Runs) -> StudyReport:
             "amplifier": Parameter(f"hard clip at {LIMIT:.4f}", "the paper's, sqrt(2 rated power)"),
             "amplitude": Parameter(float(np.abs(scene.references[0]).max()), "follows from the control power"),
         }
-        | parts.BANDPASS_PATHS,
+        | parts.bandpass_parameters(setup),
         algorithms=merits,
         extra={
             "overdrive_db": OVERDRIVES_DB,
@@ -95,8 +104,8 @@ def main(runs: Runs) -> StudyReport:
         figures=[
             *_figures_of(pairs, sweep, crossings),
             parts.draw_paths(
-                "The band-pass paths: what 128 and 32 taps realise of 20-5000 Hz.",
-                {"primary path, 128 taps": primary, "secondary path, 32 taps": secondary},
+                "The band-pass paths.",
+                {"primary path": fir_path(plant.primary[0, 0], FS), "secondary path": fir_path(scene.secondary, FS)},
             ),
         ],
         sounds=parts.sounds(results),

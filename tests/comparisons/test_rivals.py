@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from comparisons.rivals import (
     FastArrayKalman,
     FrequencyDomainKalman,
+    ImprovedMOV,
     PowerLimitedFxLMS,
     SubbandFxLMS,
     SubfilterKalman,
@@ -85,6 +86,24 @@ def test_power_limited_fxlms_settles_at_the_power_constrained_wiener_solution() 
     ).whole
     assert output_power(result.control_signal) == pytest.approx(rated, rel=0.02)
     assert noise_reduction_db(result.error, d) == pytest.approx(bound.noise_reduction_db, abs=0.1)
+
+
+def test_improved_mov_identifies_the_path_and_scales_the_best_filter_on_a_flat_one() -> None:
+    """With G_s the same at all frequencies (R_x' + gamma R_x) w = p gives sqrt(rho G_s / E[d^2]) times the best filter.
+
+    To 3 %: the penalty factor follows powers over 1024 samples of white noise, and the step keeps the weights moving.
+    """
+    x, flat = np.random.default_rng(1).standard_normal(32000), [0.0, 0.8]
+    d = lfilter(PRIMARY, [1.0], x)
+    controller = ImprovedMOV(L, flat, step_size=1e-3, rated_power=0.5, primary=np.zeros(40))
+    result = simulate(controller, x, Plant(flat, fs=FS), disturbance=d, switch_on_s=0.5)
+    identified = np.pad(PRIMARY, (0, 40 - PRIMARY.size))
+    np.testing.assert_allclose(controller.primary, identified, rtol=0, atol=1e-4)
+    best = np.pad(PRIMARY[1:], (0, L - PRIMARY.size + 1)) / 0.8
+    factor = np.sqrt(0.5 / np.sum(best**2))
+    assert factor < 0.8
+    np.testing.assert_allclose(controller.weights, factor * best, rtol=0, atol=0.03 * np.max(best))
+    assert output_power(result.control_signal) == pytest.approx(0.5, rel=0.03)
 
 
 def subfilter_run(rated_power: float) -> tuple[SubfilterKalman, Any, np.ndarray, np.ndarray]:
