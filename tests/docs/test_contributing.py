@@ -77,7 +77,7 @@ def test_a_folder_imports_only_from_folders_before_it_in_the_list(layer):
 
 
 def test_the_reader_of_imports_finds_relative_and_public_ones():
-    assert set(imported(PACKAGE / "controllers" / "fxlms.py")) == {"_types", "controllers", "power"}
+    assert set(imported(PACKAGE / "controllers" / "fxlms.py")) == {"plant", "controllers", "power"}
     assert set(imported(PACKAGE / "verdict" / "limits.py")) == {"_types", "loop", "power", "verdict"}
 
 
