@@ -503,7 +503,7 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     def _checked_reference(self, reference: Any) -> Any:
         """Return a reference as a number, or several as (I,) if the rated powers are listed for loudspeakers."""
-        one = np.size(reference) == 1 or not isinstance(self._constraint, tuple)
+        one = np.size(reference) == 1 or not isinstance(self._constraint or self._settings, tuple)
         return as_number(reference, "reference") if one else as_signal(reference, "reference")
 
     def _powers_sample(self, z: Any, H: Any, reference: Any) -> tuple[SharedConstraint, tuple[Any, Any, Any]]:
@@ -736,7 +736,7 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     @staticmethod
     def _scaled(z: Any, factor: float) -> Any:
-        return z if factor == 1.0 else factor * np.asarray(z)
+        return z if factor == 1.0 else np.float64(factor) * np.asarray(z)  # a float32 in double precision, too
 
     @property
     def alpha(self) -> float:

@@ -2,6 +2,9 @@
 
 The general filter equals it in every bit. The random walk, which sums in another order, agrees to 1e-9 of the largest
 value: the rounding of some ten steps times the condition of these problems, whose variances are 0.1 to 1000.
+
+With a rated power, filterpy's filter gets the measurement scaled by our constraint factor (eq. 9), which must be that of
+the oracle (eq. 10-13) to 1e-10, the rounding of running means.
 """
 
 from __future__ import annotations
@@ -17,14 +20,16 @@ from helpers.filterpys import Oracle
 from hypothesis import note, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from oracles.powers import Constraint
 
-from kfopc_filterpy import KFOPC
+from kfopc_filterpy import KFOPC, OutputPowerConstraint
 
 FILTERPY_2 = hasattr(Oracle, "update_sequential")  # 1.4.5 has none
 STATE = ("x", "P", "x_prior", "P_prior", "x_post", "P_post", "K", "y", "S", "SI")
 OTHERS = ("F", "Q", "R", "H", "M", "alpha")
 LIKELIHOODS = ("log_likelihood", "likelihood", "mahalanobis")
 CLOSE = 1e-9
+FS, MEMORY_S = 1000.0, 0.02  # of the powers: 20 samples
 OTHER_UPDATES = ["update_correlated", "update_steadystate"]
 PREDICTIONS = ["", "", "", "none", "none", "F", "Q", "number Q", "u", "u and B", "steady"]
 CORRECTIONS = ["", "", "", "none", "H", "H", "R", "number R", "H and R", "missed", *OTHER_UPDATES]
@@ -54,7 +59,7 @@ class Twins(RuleBasedStateMachine):
         self.oracle, self.ours = Oracle(n, m, k), ours
 
         def system(kf: Any, rng: np.random.Generator) -> None:
-            kf.x, kf.H = rng.normal(size=(n, 1)[:x_ndim]), rng.normal(size=(m, n))
+            kf.x, kf.H = rng.normal(size=(n, 1)[:x_ndim]), self.row(rng)
             kf.P, kf.R = covariance(rng, n), covariance(rng, m)
             # 1.4.5 makes M (m, m). So small that 20 updates leave P positive: filterpy would go on with a negative one.
             kf.M = 1e-3 * rng.normal(size=(n, m)) / n
@@ -96,6 +101,28 @@ class Twins(RuleBasedStateMachine):
         if m == 1:
             forms += [z.item(), np.float64(z.item()), np.array(z.item()), int(9 * z.item()), np.float32(z.item()), True]
         return forms[form % len(forms)] if form else z.reshape((m, 1)[:x_ndim])
+
+    def row(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.normal(size=self.shape()[1::-1])
+
+    def measure(self, method: str, z: Any, *before: Any, **arguments: Any) -> None:
+        """Correct the state of both."""
+        for kf in (self.oracle, self.ours):
+            getattr(kf, method)(*before, *copy.deepcopy([z]), **copy.deepcopy(arguments))
+
+    def leave(self, kf: Any) -> None:
+        """Take steps with a filter that is not used any more, or put back."""
+        kf.predict()
+        kf.update(None)
+        kf.update(self.z(np.random.default_rng(0)), **self.reference())
+
+    def asked(self, kf: Any, z: Any) -> Any:
+        """Return what a filter is asked for z."""
+        return z
+
+    def reference(self) -> dict[str, Any]:
+        """Return an argument of our `update`."""
+        return {}
 
     # A sample: a prediction and a correction of any form, and between them what a user does with the filter.
 
@@ -140,20 +167,16 @@ class Twins(RuleBasedStateMachine):
         self.moved = self.moved or form in ("u", "u and B", "steady")
 
     def correct(self, seed: int, correction: str, form: int) -> None:
-        n, m, _, _ = self.shape()
-
-        def step(kf: Any, rng: np.random.Generator) -> None:
-            if correction in OTHER_UPDATES:
-                getattr(kf, correction)(None if form == 12 else self.z(rng, form))
-                return
-            # filterpy 2.0.0 does not reshape z if H is passed
-            z, H, R = self.z(rng, 0 if "H" in correction else form), rng.normal(size=(m, n)), covariance(rng, m)
-            arguments = {"H": H} if "H" in correction else {}
-            if "R" in correction:
-                arguments["R"] = 0.4 if "number" in correction else R
-            kf.update(None if correction == "missed" else z, **arguments)
-
-        self.both(seed, step)
+        rng = np.random.default_rng(seed)
+        if correction in OTHER_UPDATES:
+            self.measure(correction, None if form == 12 else self.z(rng, form))
+            return
+        # filterpy 2.0.0 does not reshape z if H is passed
+        z, H = self.z(rng, 0 if "H" in correction else form), self.row(rng)
+        arguments: dict[str, Any] = {"H": H} if "H" in correction else {}
+        if "R" in correction:
+            arguments["R"] = 0.4 if "number" in correction else covariance(rng, len(H))
+        self.measure("update", None if correction == "missed" else z, **arguments)
 
     @rule(seed=seeds, masked=st.integers(1, 3))
     def mask(self, seed: int, masked: int) -> None:
@@ -168,7 +191,8 @@ class Twins(RuleBasedStateMachine):
             self.oracle.update(None)
             return
         oracle.dim_z = there.sum()
-        oracle.update(z[there].reshape((-1, 1)[:x_ndim]), R=oracle.R[np.ix_(there, there)], H=oracle.H[there])
+        scaled = self.ours.constraint_factor * z[there].reshape((-1, 1)[:x_ndim])
+        oracle.update(scaled, R=oracle.R[np.ix_(there, there)], H=oracle.H[there])
         for name in ("x", "P", *LIKELIHOODS):
             np.testing.assert_allclose(
                 getattr(self.ours, name), getattr(oracle, name), rtol=1e-10, atol=1e-10, err_msg=name
@@ -186,17 +210,13 @@ class Twins(RuleBasedStateMachine):
     @rule(seed=seeds, number=st.booleans())
     def update_sequentially(self, seed: int, number: bool) -> None:
         """filterpy writes into z, which must have the rows of all measurements by then."""
-        n, m, _, _ = self.shape()
+        rng, m = np.random.default_rng(seed), self.shape()[1]
         start = seed % m
-
-        def step(kf: Any, rng: np.random.Generator) -> None:
-            kf.update(None)
-            if number:
-                kf.update_sequential(start, rng.normal())
-            else:
-                kf.update_sequential(start, rng.normal(size=m - start), R_i=0.3, H_i=rng.normal(size=(m - start, n)))
-
-        self.both(seed, step)
+        self.measure("update", None)
+        if number:
+            self.measure("update_sequential", rng.normal(), start)
+        else:
+            self.measure("update_sequential", rng.normal(size=m - start), start, R_i=0.3, H_i=self.row(rng)[start:])
 
     @rule(
         seed=seeds, update_first=st.booleans(), given=st.sets(st.sampled_from(["Qs", "Hs", "Rs", "inputs", "missing"]))
@@ -208,7 +228,7 @@ class Twins(RuleBasedStateMachine):
         def batch(kf: Any, rng: np.random.Generator) -> tuple[Any, ...]:
             lists = {
                 "Qs": [covariance(rng, n) for _ in range(steps)],
-                "Hs": [rng.normal(size=(m, n)) for _ in range(steps)],
+                "Hs": [self.row(rng) for _ in range(steps)],
                 "Rs": [covariance(rng, m) for _ in range(steps)],
                 "us": [rng.normal(size=(k, 1)[:x_ndim]) for _ in range(steps)],
                 "Bs": [rng.normal(size=(n, k)) for _ in range(steps)],
@@ -253,7 +273,7 @@ class Twins(RuleBasedStateMachine):
             values = {
                 "x": rng.normal(size=(n, 1)[:x_ndim]),
                 "P": covariance(rng, n),
-                "H": rng.normal(size=(m, n)),
+                "H": self.row(rng),
                 "R": covariance(rng, m),
                 "alpha": 1.0 + 0.01 * rng.integers(2),
             } | self.model(rng)
@@ -267,15 +287,12 @@ class Twins(RuleBasedStateMachine):
     def go_on_in_a_copy(self, how: Any) -> None:
         if how == "__dict__":
             attributes = copy.deepcopy(vars(self.ours))
-            self.ours.predict()
-            self.ours.update(None)
-            self.ours.update(self.z(np.random.default_rng(0)))
+            self.leave(self.ours)
             vars(self.ours).clear()
             vars(self.ours).update(attributes)
         else:
             before, self.ours = self.ours, how(self.ours)
-            before.predict()
-            before.update(self.z(np.random.default_rng(0)))
+            self.leave(before)
             before.x[:] = before.P[:] = 7.0
         self.oracle = copy.deepcopy(self.oracle)
 
@@ -285,7 +302,7 @@ class Twins(RuleBasedStateMachine):
     def refuse(self, fault: str) -> None:
         n, m, _, _ = self.shape()
         kf, good = self.ours, self.z(np.random.default_rng(0))
-        x, P = kf.x, kf.P
+        state, P, x = kf.x, kf.P, self.reference().get("reference", 1.0)
         faults: dict[str, Callable[[], Any]] = {
             "z": lambda: kf.update(np.full((m, 1), np.nan)),
             "z size": lambda: kf.update(np.ones(m + 1)),
@@ -293,14 +310,14 @@ class Twins(RuleBasedStateMachine):
             "R": lambda: kf.update(good, R=-1.0),
             "Q": lambda: kf.predict(Q=-1.0),
             "F": lambda: kf.predict(F=np.eye(n + 1)),
-            "P": lambda: (setattr(kf, "P", -np.eye(n)), kf.update(good)),
-            "batch": lambda: kf.batch_filter([good, good, np.full((m, 1), np.inf)]),
-            "x": lambda: (setattr(kf, "x", np.full(x.shape, np.nan)), kf.predict()),
+            "P": lambda: (setattr(kf, "P", -np.eye(n)), kf.predict()),
+            "batch": lambda: kf.batch_filter([good, good, np.full((m, 1), np.inf)], references=[x] * 3),
+            "x": lambda: (setattr(kf, "x", np.full(state.shape, np.nan)), kf.predict()),
         }
         with pytest.raises(ValueError, match=r"[A-Za-z]+ .*(must|would)"):
             faults[fault]()
         if fault in "xP":
-            kf.x, kf.P = x, P
+            kf.x, kf.P = state, P
 
     @rule(seed=seeds)
     def ask(self, seed: int) -> None:
@@ -308,11 +325,11 @@ class Twins(RuleBasedStateMachine):
         if FILTERPY_2:  # 1.4.5's takes u only, and needs B
             arguments = {"u": np.ones((k, 1)[:x_ndim]), "B": np.ones((n, k))} if seed % 2 else {}
             self.query(seed, lambda kf, _: kf.get_prediction(**arguments), "get_prediction")
-        self.query(seed, lambda kf, rng: kf.get_update(self.z(rng)), "get_update")
-        self.query(seed, lambda kf, rng: kf.residual_of(self.z(rng)), "residual_of")
+        self.query(seed, lambda kf, rng: kf.get_update(self.asked(kf, self.z(rng))), "get_update")
+        self.query(seed, lambda kf, rng: kf.residual_of(self.asked(kf, self.z(rng))), "residual_of")
         self.query(seed, lambda kf, _: kf.measurement_of_state(kf.x), "measurement_of_state")
         if np.any(self.oracle.S):
-            self.query(seed, lambda kf, rng: kf.log_likelihood_of(self.z(rng)), "log_likelihood_of")
+            self.query(seed, lambda kf, rng: kf.log_likelihood_of(self.asked(kf, self.z(rng))), "log_likelihood_of")
             for name in LIKELIHOODS:
                 self.require_same(getattr(self.oracle, name), getattr(self.ours, name), name)
 
@@ -352,7 +369,189 @@ class RandomWalk(Twins):
         np.testing.assert_allclose(got, expected, rtol=0, atol=CLOSE * scale, err_msg=what)
 
 
+class Powers:
+    """Eq. 10-13 for each loudspeaker, with the values that a user supplied in place of the estimates."""
+
+    def __init__(self, rated: Any) -> None:
+        self.each = [Constraint(power, fs=FS, memory_s=MEMORY_S) for power in np.atleast_1d(rated)]
+        self.supplied: dict[str, float] = {}
+
+    def take(self, z: np.ndarray, newest: np.ndarray, x: Any) -> None:
+        """Take a sample; squares are summed over measurements and references, `newest` is (K, J, I)."""
+        for j, one in enumerate(self.each):
+            if x is None:
+                one.disturbance_power = one.d2.take(np.sum(z**2))
+            else:
+                one.take(np.sum(z**2), np.sum(newest[:, j] ** 2), np.sum(np.square(x)))
+
+    def values(self) -> tuple[Any, ...]:
+        """Return the factor, the least of the loudspeakers that are heard, and the powers and gains that lead to it."""
+        power, gain = (
+            np.array([self.supplied.get(name, getattr(one, own)) for one in self.each])
+            for name, own in (("disturbance_power", "disturbance_power"), ("secondary_path_gain", "gain"))
+        )
+        factors = np.minimum(np.sqrt([one.rated_power for one in self.each] * gain / power), 1.0)
+        heard = factors[gain != 0] if gain.any() else factors
+        return self.supplied.get("constraint_factor", heard.min()), power, gain
+
+
+class Rated(Twins):
+    """Filters with rated powers, of which a user assigns some."""
+
+    powers: Powers | None = None
+    unconstrained_factor = 1.0
+
+    @initialize(
+        loudspeakers=st.sampled_from([None, 1, 2]),
+        filters=st.tuples(*[st.integers(1, 2)] * 2),
+        m=st.integers(1, 3),
+        x_ndim=st.integers(1, 2),
+        unheard=st.booleans(),
+        seed=seeds,
+    )
+    def start(
+        self, loudspeakers: int | None, filters: tuple[int, int], m: int, x_ndim: int, unheard: bool, seed: int
+    ) -> None:
+        """None: one loudspeaker, whose rated power is a number."""
+        self.loudspeakers, references, taps = loudspeakers or 1, filters[0] if loudspeakers else 1, filters[1]
+        self.unheard, self.references = unheard and self.loudspeakers > 1, references
+        rated = np.array([0.5, 2.0])[: self.loudspeakers]
+        each = [OutputPowerConstraint(power, fs=FS, memory_s=MEMORY_S) for power in rated]
+        n = self.loudspeakers * references * taps
+        self.begin_rated(KFOPC(n, m, 1, constraint=each if loudspeakers else each[0]), rated, x_ndim, seed)
+
+    def begin_rated(self, ours: KFOPC, rated: np.ndarray, x_ndim: int, seed: int) -> None:
+        self.rng, self.powers = np.random.default_rng(seed), Powers(rated)
+        self.begin(ours, ours.dim_x, ours.dim_z, 1, x_ndim, seed)
+        for _ in range(2):  # an H that never changes is refused
+            self.measure("update", self.z(self.rng), H=self.row(self.rng))
+
+    def row(self, rng: np.random.Generator) -> np.ndarray:
+        row = super().row(rng)
+        if self.unheard:
+            row[:, : row.shape[1] // 2] = 0.0
+        return row
+
+    def model(self, rng: np.random.Generator) -> dict[str, Any]:
+        return super().model(rng) | {"F": np.eye(self.oracle.dim_x)}
+
+    def reference(self, may_lack: bool = False) -> dict[str, Any]:
+        """Return an argument of `update`: one reference as a number, several as (I,), or none if it is not needed."""
+        if (
+            may_lack
+            and self.powers is not None
+            and self.powers.supplied.keys() & {"constraint_factor", "secondary_path_gain"}
+        ):
+            return {}
+        x = self.rng.normal(size=self.references)
+        return {"reference": x if self.references > 1 else x.item()}
+
+    def measure(self, method: str, z: Any, *before: Any, given: dict[str, Any] | None = None, **arguments: Any) -> None:
+        if method == "update_sequential" and np.size(z) < self.oracle.dim_z:
+            return  # a rated power needs all measurements at once
+        if z is None:
+            super().measure(method, z, *before, **arguments)
+            return
+        given = self.reference(may_lack=self.rng.random() < 0.3) if given is None else given
+        getattr(self.ours, method)(*before, *copy.deepcopy([z]), **copy.deepcopy(arguments), **given)
+        factor = self.ours.constraint_factor
+        if self.powers is None:
+            assert factor == self.unconstrained_factor
+        else:
+            rows = arguments.get("H", arguments.get("H_i", self.oracle.H))
+            filters = self.oracle.dim_z, self.loudspeakers, self.references, -1
+            self.powers.take(np.asarray(z, float), np.reshape(rows, filters)[..., 0], given.get("reference"))
+            for got, expected in zip(self.readings(), self.powers.values(), strict=True):
+                np.testing.assert_allclose(got, np.reshape(expected, np.shape(got)), rtol=1e-10)
+        self.read = self.readings()
+        getattr(self.oracle, method)(*before, self.asked(self.oracle, z), **copy.deepcopy(arguments))
+        self.oracle.z = np.asarray(z, float).reshape(np.shape(self.oracle.z))
+
+    def asked(self, kf: Any, z: Any) -> Any:
+        factor = self.ours.constraint_factor
+        return z if kf is self.ours or factor == 1.0 else np.float64(factor) * np.asarray(z)  # a float32, too
+
+    def readings(self) -> list[Any]:
+        return [getattr(self.ours, name) for name in ("constraint_factor", "disturbance_power", "secondary_path_gain")]
+
+    def predict(self, seed: int, form: str) -> None:
+        super().predict(seed, "Q" if form == "F" else form)
+
+    def look(self) -> None:
+        super().look()
+        if hasattr(self, "read"):  # nothing but a measurement changes them
+            assert repr(self.readings()) == repr(self.read)
+
+    @rule(
+        name=st.sampled_from(
+            ["rated_power", "constraint", "constraint_factor", "disturbance_power", "secondary_path_gain"]
+        ),
+        value=st.floats(0.1, 4.0) | st.none(),
+    )
+    def assign_a_power(self, name: str, value: float | None) -> None:
+        if name == "constraint" or (name == "rated_power" and value is None):
+            setattr(self.ours, name, None)
+            self.powers = None
+            assert self.ours.rated_power is self.ours.constraint is None
+        elif name == "rated_power":
+            self.ours.rated_power = value
+            if self.powers is None:
+                self.powers = Powers(np.full(self.loudspeakers, value))
+            for one in self.powers.each:
+                one.rated_power = value
+        elif self.powers is not None:
+            setattr(self.ours, name, value)
+            self.powers.supplied = {key: own for key, own in self.powers.supplied.items() if key != name}
+            self.powers.supplied |= {} if value is None else {name: value}
+        elif name == "constraint_factor":
+            self.ours.constraint_factor, self.unconstrained_factor = value, 1.0 if value is None else value
+        else:
+            with pytest.raises(ValueError, match=rf"{name} needs a constraint: set rated_power first"):
+                setattr(self.ours, name, value)
+        self.read = self.readings()
+
+    @rule(seed=seeds, masked=st.integers(1, 3))
+    def mask(self, seed: int, masked: int) -> None:
+        if self.powers is None:
+            super().mask(seed, masked)
+        else:
+            self.ours.update(np.ma.masked_all(self.oracle.dim_z))
+            self.oracle.update(None)
+
+    @rule(seed=seeds, update_first=st.booleans())
+    def batch_and_smooth(self, seed: int, update_first: bool) -> None:
+        """A batch is its steps."""
+        rng, batch = np.random.default_rng(seed), copy.deepcopy(self.ours)
+        zs = [self.z(rng), None, self.z(rng)]
+        Hs, given = [self.row(rng) for _ in zs], [self.reference() for _ in zs]
+        references = [one["reference"] for one in given]
+        means, covariances, _, _ = batch.batch_filter(zs, Hs=Hs, references=references, update_first=update_first)
+        for k, z in enumerate(zs):
+            for updates in (update_first, not update_first):
+                if updates:
+                    self.measure("update", z, H=Hs[k], given=given[k])
+                    np.testing.assert_array_equal(means[k], self.ours.x)
+                    np.testing.assert_array_equal(covariances[k], self.ours.P)
+                else:
+                    self.predict(seed, "")
+        self.ours = batch
+
+
+class RatedWalk(Rated, RandomWalk):
+    loudspeakers, references, unheard = 1, 1, False
+
+    @initialize(n=st.integers(1, 9), x_ndim=st.integers(1, 2), seed=seeds)
+    def start(self, n: int, x_ndim: int, seed: int) -> None:
+        constraint = OutputPowerConstraint(0.5, fs=FS, memory_s=MEMORY_S)
+        ours = KFOPC.random_walk(n, state_noise=1.0, measurement_noise=1.0, constraint=constraint)
+        self.begin_rated(ours, np.array([0.5]), x_ndim, seed)
+
+
+def several(examples: int) -> settings:
+    return settings(max_examples=examples, stateful_step_count=20, report_multiple_bugs=False)
+
+
 TestGeneral, TestRandomWalk = General.TestCase, RandomWalk.TestCase
-TestGeneral.settings = TestRandomWalk.settings = settings(
-    max_examples=150, stateful_step_count=20, report_multiple_bugs=False
-)
+TestRated, TestRatedWalk = Rated.TestCase, RatedWalk.TestCase
+TestGeneral.settings = TestRandomWalk.settings = several(150)
+TestRated.settings = TestRatedWalk.settings = several(60)
