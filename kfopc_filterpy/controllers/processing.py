@@ -124,7 +124,7 @@ def checked_block(
     x, e = block_signals(controller, references, errors)
     flags = adapt_flags(adapt, x.shape[-1])
     require_apart(out, x, e)
-    if states_channels(controller):
+    if hasattr(controller, "multichannel"):
         out = output_array(out, ((controller.n_loudspeakers,) if controller.multichannel else ()) + x.shape[-1:])
     return x, e, flags, out
 

@@ -91,23 +91,6 @@ def test_what_was_played_before_a_pause_is_still_subtracted() -> None:
 ONE, SEVERAL = MAKERS["FxLMS"](), fx_lms(4, np.ones((2, 3, 4)), step_size=0.1, n_references=2)
 
 
-def test_listening_leaves_the_users_amplifier_alone() -> None:
-    one = FeedbackNeutralizer(Recorder(), [0.0, 1.0], amplifier=OwnAmplifier())
-    one.listen([1.0, 2.0], [0.0, 0.0])
-    one.control_signal(3.0)
-    assert one.control_signal(0.0) == -6.0  # it plays twice what it gets
-
-
-class OwnAmplifier:
-    """An amplifier of a user that cannot be copied."""
-
-    def __call__(self, y: float) -> float:
-        return 2.0 * y
-
-    def __deepcopy__(self, memo: Any) -> Any:
-        raise TypeError("cannot be copied")
-
-
 class Recorder:
     """A controller that emits its reference and keeps what it listens to."""
 

@@ -167,16 +167,6 @@ def test_a_start_from_near_silence_is_no_louder_than_any_other(past: float, begi
         assert noise_reduction_db(result.error, result.disturbance) > 25.0
 
 
-@pytest.mark.parametrize("quiet", [0.0, 1e-6, 1e-3])
-def test_a_quiet_passage_makes_nothing_loud(quiet: float) -> None:
-    """8 s of it: the weights would follow the noise of the microphones, and be loud when the noise comes back."""
-    n = 16000
-    x = np.random.default_rng(0).standard_normal(10 * n)
-    x[n:-n] *= quiet
-    result = run((64, 64, 64), x, 0.2, sensor_noise_std=1e-3, rng=3)
-    assert np.abs(result.control_signal[-n:]).max() < 1.5 * np.abs(result.control_signal[:n]).max()
-
-
 def noise_of(kind: str, n: int, rng: np.random.Generator) -> np.ndarray:
     """Return a noise of power 1."""
     t = np.arange(n)
@@ -255,12 +245,6 @@ def test_the_error_stays_bounded(
 def test_settings_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         frequency_domain_fx_lms(**{"n_taps": 16, "secondary": SECONDARY, "block_size": 8, "step_size": 0.1} | options)
-
-
-def test_an_error_without_its_control_signal_is_refused() -> None:
-    controller = near_wiener()
-    with pytest.raises(ValueError, match="must follow the control_signal"):
-        controller.update(1.0)
 
 
 @pytest.mark.parametrize(("where", "largest"), [("reference", 1e20), ("disturbance", 1e100)])

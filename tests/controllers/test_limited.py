@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import pickle
 from typing import Any
@@ -12,12 +11,10 @@ import pytest
 from helpers.comparing import assert_same_run
 from helpers.controllers import MAKERS
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, S_HAT, N, noises
-from helpers.naming import plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kfopc_filterpy import (
-    HardClipAmplifier,
     LimitedController,
     OutputLimiter,
     Plant,
@@ -50,15 +47,6 @@ def assert_kept(y: np.ndarray, rated_power: float = RATED_POWER) -> None:
 
 
 # ---- In the loop
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_what_fits_passes_as_if_there_were_no_limiter(name: str) -> None:
-    """Its rated power is a hundred times the control signal's largest window."""
-    options = {"record_weights_every": 1}
-    free = run(MAKERS[name](), **options)
-    limited = run(MAKERS[name](limiter=limiter(100.0 * worst_window(free.control_signal))), **options)
-    assert_same_run(free, limited)
 
 
 # ---- The bound
@@ -112,17 +100,6 @@ def test_a_limiter_can_be_assigned_and_removed(name: str) -> None:
     before = pickle.dumps(own)
     run(assigned)
     assert pickle.dumps(own) == before  # it is out of the loop
-
-
-@pytest.mark.parametrize("wrong", [1.0, OutputLimiter, HardClipAmplifier(1.0)], ids=plain)
-def test_what_is_no_limiter_is_refused(wrong: Any) -> None:
-    made = MAKERS["FxLMS"](limiter=limiter())
-    own = made.limiter
-    with pytest.raises(TypeError, match="limiter must be an OutputLimiter or None"):
-        made.limiter = wrong
-    assert made.limiter is own
-    with pytest.raises(TypeError, match="limiter must be an OutputLimiter or None"):
-        MAKERS["FxLMS"](limiter=wrong)
 
 
 def test_a_limiter_of_another_rate_is_refused_before_anything_changes() -> None:
@@ -204,17 +181,3 @@ def test_a_users_controller_is_told_what_is_played_and_the_rest_is_its_own() -> 
 def test_refusals_of_a_limited_controller(own: Any, limits: Any, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
         LimitedController(own, limits)
-
-
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
-def test_a_copy_is_limited_too(copied: Any) -> None:
-    other = copied(LimitedController(Proportional(), OutputLimiter(1.0, amplitude_limit=2.0, fs=16000)))
-    assert isinstance(other, LimitedController)
-    assert other.control_signal(1.0) == 2.0
-
-
-def test_nan_is_a_divergence_as_without_the_limiter() -> None:
-    own = Proportional()
-    own.gain = math.nan
-    for made in (own, LimitedController(own, limiter())):
-        assert run(made, n=20).diverged_at_s == 0.0

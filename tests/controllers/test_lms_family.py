@@ -207,9 +207,6 @@ def run(controller: Any, x: np.ndarray) -> Any:
     return simulate(controller, x, Plant(PATHS, PRIMARY, fs=FS))
 
 
-ONE_PATH = np.array([0.0, 0.7, -0.25, 0.1])
-
-
 # ---- Several channels: where they settle
 
 
@@ -257,13 +254,6 @@ def test_a_matrix_of_systems_is_a_secondary_path() -> None:
         simulate(controller, noises(100), Plant(PATHS, PRIMARY, fs=500.0))
 
 
-def test_several_references_need_no_channel_axes() -> None:
-    one = fx_lms(L, ONE_PATH, step_size=0.01, n_references=2)
-    assert one.weights.shape == (1, 2, L)
-    assert repr(one) == "<FxLMS: 1 microphone, 1 loudspeaker, 2 references, 5 taps, constraint factor 1>"
-    assert one.control_signal([1.0, 2.0]).shape == (1,)
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -286,10 +276,3 @@ def test_signals_that_do_not_fit_are_refused_with_nothing_changed(call: Callable
     with pytest.raises(ValueError, match=message):
         call(refusing)
     assert_same_run(run(refusing, noises(20)), run(twin, noises(20)))
-
-
-def test_one_channel_refuses_arrays_and_several_channels_need_paths_with_axes() -> None:
-    with pytest.raises(TypeError, match="error must be a single number"):
-        fx_lms(L, ONE_PATH, step_size=0.01).update([1.0, 2.0])
-    with pytest.raises(ValueError, match="the controller is made for 1"):
-        run(fx_lms(L, ONE_PATH, step_size=0.01), noises(9))

@@ -33,7 +33,6 @@ from kfopc_filterpy.controllers import leak_factor, penalty_factor
 
 L = 6
 PATH, PATHS = np.array([0.0, 0.8, -0.3]), random_paths(3, 2, 4, seed=1)
-BANK = np.ones((2, L))
 STEP, RATED = {"step_size": 0.1}, {"rated_power": 1.0, "fs": 8000.0}
 KALMAN = {"state_noise": 1e-5, "measurement_noise": 0.1, "initial_variance": 1.0}
 POWERS = {"disturbance_power": 1.0, "secondary_path_gain": 1.0}

@@ -113,18 +113,6 @@ def test_with_an_internal_model_the_noise_at_the_virtual_places_is_the_reference
     assert np.abs(want.control_signal).max() > 0.01
 
 
-def test_listening_leaves_the_users_amplifier_alone() -> None:
-    class Own:
-        def __call__(self, y: float) -> float:
-            return y
-
-        def __deepcopy__(self, memo: Any) -> Any:
-            raise TypeError("cannot be copied")
-
-    got, want = run(made(amplifier=Own()), switch_on_s=50 / FS), run(made(), switch_on_s=50 / FS)
-    np.testing.assert_allclose(got.error, want.error, rtol=0, atol=1e-12)
-
-
 def test_known_amplifiers_keep_the_estimate_right_when_they_clip() -> None:
     signals = 2.0 * np.random.default_rng(4).standard_normal((J, 300))
     clip = [HardClipAmplifier(0.5), HardClipAmplifier(1.0)]

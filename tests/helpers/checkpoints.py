@@ -33,11 +33,17 @@ class Room:
         else:
             self.x, self.d, _ = noises(N)
             self.path, self.played = 1.1 * S_HAT, np.zeros(S_HAT.size)
+        if getattr(controller, "n_references", 1) == 0:
+            self.x = None
         self.n = 0
+
+    def heard(self, n: int | slice) -> tuple[Any, Any]:
+        """Return the references, or None, and the disturbances of some samples; channels lead."""
+        return None if self.x is None else self.x[n].T, self.d[n].T
 
     def play(self, controller: Any) -> Any:
         """Let the controller emit the next sample."""
-        y = controller.control_signal(self.x[self.n])
+        y = controller.control_signal(self.heard(self.n)[0])
         self.played = np.roll(self.played, 1, axis=0)
         self.played[0] = y
         return y

@@ -36,6 +36,7 @@ from kfopc_filterpy.controllers import (
     FeedbackNeutralizer,
     KalmanObserver,
     VirtualMicrophones,
+    with_internal_model,
 )
 from kfopc_filterpy.paths import PathTolerance
 
@@ -53,22 +54,24 @@ def short_blocks(taps: int, path: Any, **settings: Any) -> Any:
 
 
 MAKERS: dict[str, Any] = {
-    "KF-ANC": lambda **o: kf_anc(N_TAPS, S_HAT, **KALMAN, **o),
-    "KF-OPC": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
-    "KF-OPC, sliding": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(window="sliding"), **KALMAN, **o),
-    "KF-PB": lambda **o: short_blocks(N_TAPS, S_HAT, rated_power=0.3, **o),
-    "fxRLS": lambda **o: fx_rls(N_TAPS, S_HAT, forgetting=0.999, **o),
-    "diagonal KF": lambda **o: diagonal_kf(N_TAPS, S_HAT, **KALMAN, **o),
-    "diagonal KF-OPC": lambda **o: diagonal_kf(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
-    "FxLMS": lambda **o: fx_lms(N_TAPS, S_HAT, step_size=MU, **o),
-    "FxNLMS": lambda **o: fx_nlms(N_TAPS, S_HAT, step_size=0.1, **o),
-    "leaky": lambda **o: leaky_fx_lms(N_TAPS, S_HAT, step_size=MU, leak=0.3, **o),
-    "optimal leaky": lambda **o: optimal_leaky_fx_lms(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), **o),
-    "MOV": lambda **o: mov_fx_lms(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), **o),
-    "MOV, modified": lambda **o: mov_fx_lms(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), modified=True, **o),
-    "two-gradient": lambda **o: two_gradient_fx_lms(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
-    "re-scaling": lambda **o: rescaling_fx_lms(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
-    "clipping": lambda **o: clipping_fx_lms(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
+    "KF-ANC": lambda s=S_HAT, **o: kf_anc(N_TAPS, s, **KALMAN, **o),
+    "KF-OPC": lambda s=S_HAT, **o: kf_opc(N_TAPS, s, constraint=constraint(), **KALMAN, **o),
+    "KF-OPC, sliding": lambda s=S_HAT, **o: kf_opc(N_TAPS, s, constraint=constraint(window="sliding"), **KALMAN, **o),
+    "KF-PB": lambda s=S_HAT, **o: short_blocks(N_TAPS, s, rated_power=0.3, **o),
+    "fxRLS": lambda s=S_HAT, **o: fx_rls(N_TAPS, s, forgetting=0.999, **o),
+    "diagonal KF": lambda s=S_HAT, **o: diagonal_kf(N_TAPS, s, **KALMAN, **o),
+    "diagonal KF-OPC": lambda s=S_HAT, **o: diagonal_kf(N_TAPS, s, constraint=constraint(), **KALMAN, **o),
+    "FxLMS": lambda s=S_HAT, **o: fx_lms(N_TAPS, s, step_size=MU, **o),
+    "FxNLMS": lambda s=S_HAT, **o: fx_nlms(N_TAPS, s, step_size=0.1, **o),
+    "leaky": lambda s=S_HAT, **o: leaky_fx_lms(N_TAPS, s, step_size=MU, leak=0.3, **o),
+    "optimal leaky": lambda s=S_HAT, **o: optimal_leaky_fx_lms(N_TAPS, s, step_size=MU, constraint=constraint(), **o),
+    "MOV": lambda s=S_HAT, **o: mov_fx_lms(N_TAPS, s, step_size=MU, constraint=constraint(), **o),
+    "MOV, modified": lambda s=S_HAT, **o: mov_fx_lms(
+        N_TAPS, s, step_size=MU, constraint=constraint(), modified=True, **o
+    ),
+    "two-gradient": lambda s=S_HAT, **o: two_gradient_fx_lms(N_TAPS, s, step_size=MU, amplitude_limit=0.5, **o),
+    "re-scaling": lambda s=S_HAT, **o: rescaling_fx_lms(N_TAPS, s, step_size=MU, amplitude_limit=0.5, **o),
+    "clipping": lambda s=S_HAT, **o: clipping_fx_lms(N_TAPS, s, step_size=MU, amplitude_limit=0.5, **o),
 }
 KNOWS_AN_AMPLIFIER = [
     name
@@ -108,28 +111,28 @@ def limiters() -> list[OutputLimiter]:
 
 
 SEVERAL: dict[str, Any] = {
-    "kf_anc": lambda: kf_anc(L, PATHS, **KALMAN, **MANY),
-    "kf_opc": lambda: kf_opc(L, PATHS, constraint=constraints(), limiter=limiters(), **KALMAN, **MANY),
-    "kf_pb": lambda: short_blocks(L, PATHS, rated_power=[0.02, 0.05], **MANY),
-    "kf_pb, exact path": lambda: short_blocks(
-        L, PATHS, rated_power=0.05, secondary_path_uncertainty=None, limiter=limiters(), **MANY
+    "kf_anc": lambda s=PATHS: kf_anc(L, s, **KALMAN, **MANY),
+    "kf_opc": lambda s=PATHS: kf_opc(L, s, constraint=constraints(), limiter=limiters(), **KALMAN, **MANY),
+    "kf_pb": lambda s=PATHS: short_blocks(L, s, rated_power=[0.02, 0.05], **MANY),
+    "kf_pb, exact path": lambda s=PATHS: short_blocks(
+        L, s, rated_power=0.05, secondary_path_uncertainty=None, limiter=limiters(), **MANY
     ),
-    "DiagonalKalman": lambda: diagonal_kf(L, PATHS, constraint=constraints(), limiter=limiters(), **KALMAN, **MANY),
-    "FxLMS": lambda: fx_lms(L, PATHS, step_size=MU, limiter=limiters(), **MANY),
-    "FxNLMS": lambda: fx_nlms(L, PATHS, step_size=0.1, **MANY),
-    "LeakyFxLMS": lambda: leaky_fx_lms(L, PATHS, step_size=MU, leak=[0.3, 0.1], **MANY),
-    "OptimalLeakyFxLMS": lambda: optimal_leaky_fx_lms(L, PATHS, step_size=MU, constraint=constraints(), **MANY),
-    "MOVFxLMS": lambda: mov_fx_lms(L, PATHS, step_size=MU, constraint=constraints(), modified=True, **MANY),
-    "TwoGradientFxLMS": lambda: two_gradient_fx_lms(L, PATHS, step_size=MU, amplitude_limit=0.5, **MANY),
-    "RescalingFxLMS": lambda: rescaling_fx_lms(L, PATHS, step_size=MU, amplitude_limit=[0.1, 0.5], **MANY),
-    "ClippingFxLMS": lambda: clipping_fx_lms(L, PATHS, step_size=MU, amplitude_limit=0.5, **MANY),
+    "DiagonalKalman": lambda s=PATHS: diagonal_kf(L, s, constraint=constraints(), limiter=limiters(), **KALMAN, **MANY),
+    "FxLMS": lambda s=PATHS: fx_lms(L, s, step_size=MU, limiter=limiters(), **MANY),
+    "FxNLMS": lambda s=PATHS: fx_nlms(L, s, step_size=0.1, **MANY),
+    "LeakyFxLMS": lambda s=PATHS: leaky_fx_lms(L, s, step_size=MU, leak=[0.3, 0.1], **MANY),
+    "OptimalLeakyFxLMS": lambda s=PATHS: optimal_leaky_fx_lms(L, s, step_size=MU, constraint=constraints(), **MANY),
+    "MOVFxLMS": lambda s=PATHS: mov_fx_lms(L, s, step_size=MU, constraint=constraints(), modified=True, **MANY),
+    "TwoGradientFxLMS": lambda s=PATHS: two_gradient_fx_lms(L, s, step_size=MU, amplitude_limit=0.5, **MANY),
+    "RescalingFxLMS": lambda s=PATHS: rescaling_fx_lms(L, s, step_size=MU, amplitude_limit=[0.1, 0.5], **MANY),
+    "ClippingFxLMS": lambda s=PATHS: clipping_fx_lms(L, s, step_size=MU, amplitude_limit=0.5, **MANY),
 }
 
 # Controllers that adapt once per block. Runs of 300 samples end within one.
 
 IN_BLOCKS: dict[str, Any] = {
     "frequency domain": lambda: frequency_domain_fx_lms(N_TAPS, S_HAT, step_size=0.2, block_size=7),
-    "block LMS": lambda: frequency_domain_fx_lms(N_TAPS, S_HAT, step_size=MU, block_size=14, forgetting=None),
+    "block LMS": lambda s=S_HAT: frequency_domain_fx_lms(N_TAPS, s, step_size=MU, block_size=14, forgetting=None),
     "unconstrained": lambda: frequency_domain_fx_lms(
         56, S_HAT, step_size=0.1, block_size=7, partition_size=28, constrained=False
     ),
@@ -236,8 +239,20 @@ AROUND: dict[str, Any] = {
 }
 OWN = (OwnFilter, OwnController)  # what loading them needs beyond the package
 
+# With an internal model: feedback control has no reference, hybrid control has some, too.
+
+INTERNAL: dict[str, Any] = {
+    f"feedback {name}": lambda n=name: with_internal_model(MAKERS[n]()) for name in ("FxLMS", "KF-OPC", "KF-PB", "MOV")
+}
+INTERNAL |= {
+    "feedback filterpy's": lambda: with_internal_model(
+        KalmanController(KFOPC.random_walk(N_TAPS, constraint=constraint(), **KALMAN), S_HAT)
+    ),
+    "hybrid, many": lambda: with_internal_model(fx_lms(L, PATHS, step_size=MU, limiter=limiters(), n_references=I + K)),
+}
+
 ALL: dict[str, Any] = {f"{name} {variant}": lambda n=name, v=variant: made(n, v) for name, variant in VARIANTS}
-ALL |= {f"{name} many": make for name, make in SEVERAL.items()} | IN_BLOCKS | AROUND
+ALL |= {f"{name} many": make for name, make in SEVERAL.items()} | IN_BLOCKS | AROUND | INTERNAL
 
 FILTERS: dict[str, Any] = {
     "KFOPC": lambda: _full(rated_power=0.3, fs=FS),

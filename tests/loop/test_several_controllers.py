@@ -14,15 +14,12 @@ from kfopc_filterpy import (
     KFOPC,
     HardClipAmplifier,
     KalmanController,
-    OutputLimiter,
     OutputPowerConstraint,
     Plant,
     fx_lms,
-    fx_rls,
     kf_anc,
     kf_opc,
     kf_pb,
-    mov_fx_lms,
     simulate,
 )
 from kfopc_filterpy.controllers import with_internal_model
@@ -113,37 +110,6 @@ def test_runs_that_share_gains_are_their_runs_one_by_one(shared, count, n, of_fi
         assert min(r.constraint_factor.min() for r in results) < 0.9  # it did act, and so did the amplifiers
         saturated = {i % 4 for i, r in enumerate(results) if np.any(r.amplifier_output != r.control_signal)}
         assert saturated == {2, 3} & set(range(count))
-
-
-def guarded(rated_power):
-    made = kf_opc(7, S_HAT, rated_power=rated_power, fs=FS, state_noise=1e-5, measurement_noise=0.1)
-    made.limiter = OutputLimiter(rated_power, fs=FS)
-    made.secondary_path_uncertainty = 1.0
-    return made
-
-
-def supplied(rated_power):
-    made = kf_opc(7, S_HAT, rated_power=rated_power, fs=FS, state_noise=1e-5, measurement_noise=0.1)
-    made.constraint.factor = rated_power
-    return made
-
-
-ALGORITHMS = {
-    "FxRLS": lambda _: fx_rls(7, S_HAT, forgetting=0.999),
-    "limiter and guard": guarded,
-    "factor supplied": supplied,
-    "FxLMS": lambda _: fx_lms(7, S_HAT, step_size=0.01),
-    "MOV-FxLMS": lambda power: mov_fx_lms(7, S_HAT, step_size=0.01, rated_power=power, fs=FS),
-}
-
-
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_any_algorithm_of_the_core_shares(shared, name):
-    made, alone = ([ALGORITHMS[name](power) for power in (0.05, 0.1, 0.4)] for _ in range(2))
-    x, plants, own = differing(3, 500)
-    for _ in range(2):  # and they go on
-        assert_as_alone(simulate(made, x, plants, **own), one_by_one(alone, x, plants, own), made, alone)
-    assert shared == [3, 3]
 
 
 def test_what_is_one_for_all(shared):
