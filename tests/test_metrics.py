@@ -92,11 +92,6 @@ def test_overshoot_is_the_highest_full_window():
     assert overshoot(burst, 1.0, FS, window_s=0.05) == pytest.approx(100 / 800, rel=1e-12)
 
 
-def test_overshoot_window_longer_than_the_run_is_the_run():
-    y = noise(100)
-    assert overshoot(y, 1.0, FS, window_s=10.0) == pytest.approx(np.mean(y**2), rel=1e-12)
-
-
 def test_clipped_fraction_of_a_sine_is_the_arc_cosine():
     y = sine(37.0, 160000, 2.0)
     # abs(2 sin) > 1 for 2/3 of a period; 185 periods of steady portion, an edge of 4 samples in each.
@@ -147,13 +142,6 @@ def test_harmonics_are_those_of_the_steady_portion():
     assert harmonics_db(e, d, 400.0, FS) == harmonics_db(e[half], d[half], 400.0, FS, steady=1.0)
 
 
-def test_harmonics_leak_floor_is_below_minus_100_db():
-    for frequency in np.linspace(16, 25, 20):
-        angle = 2 * np.pi * frequency / 640 * np.arange(640)
-        # The hardest case: the fewest periods that are accepted.
-        assert harmonics_db(np.sin(angle + 1.0), np.sin(angle), frequency, 640, steady=1.0) < -100
-
-
 def test_harmonics_above_half_the_sampling_rate_are_left_out():
     d = sine(3000, 16000)
     assert harmonics_db(d + sine(6000, 16000, 0.1), d, 3000.0, FS) == pytest.approx(-20.0, abs=1e-6)
@@ -202,14 +190,6 @@ def test_coherence_of_signal_and_noise_is_the_power_ratio():
     assert gain == pytest.approx(0.5, abs=0.005)
 
 
-def test_coherence_gain_is_that_of_the_band_only():
-    n = 2 * FS
-    low, high = sine(500, n), sine(5000, n)
-    _, gain = coherence_and_gain(low + high, 0.5 * low + 9.0 * high, FS, (300.0, 700.0))
-    # Leakage of the Hann window over 70 bins: below 1e-10 of the power.
-    assert gain == pytest.approx(0.5, abs=1e-6)
-
-
 def test_density_integrates_to_the_power():
     x = noise(20 * FS)
     f, level = power_spectrum_db(x, FS, steady=1.0)
@@ -233,12 +213,6 @@ def test_short_time_power_is_the_direct_mean_of_the_samples_there_are(window):
     x = noise(101)
     expected = [np.mean(x[max(0, n - window + 1) : n + 1] ** 2) for n in range(101)]
     np.testing.assert_allclose(short_time_power(x, FS, window / FS), expected, rtol=1e-12)
-
-
-def test_short_time_power_ends_at_the_output_power_and_its_peak_is_the_overshoot():
-    y = noise(1000)
-    assert short_time_power(y, FS, 500 / FS)[-1] == pytest.approx(output_power(y), rel=1e-12)
-    assert short_time_power(y, FS, 0.005)[79:].max() / 0.5 == overshoot(y, 0.5, FS, window_s=0.005)
 
 
 # ---- channels and runs

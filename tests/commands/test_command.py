@@ -7,12 +7,10 @@ import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 from helpers.commands import FS, ROOT, SCENE, process
 
 from kfopc_filterpy import __version__
-from kfopc_filterpy.signals import write_wav
 
 
 def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
@@ -91,17 +89,6 @@ def test_an_error_is_one_line_that_says_what_to_do(command, arguments):
     assert ERRORS[arguments] in err
     assert err.count("\n") == 1
     assert err.startswith("kfopc")
-
-
-def test_a_path_of_far_too_many_taps_is_refused_before_anything_runs(command, folder):
-    write_wav(folder / "minutes.wav", np.resize([1.0, -1.0, 0.5], 71000), FS)
-    rows = "".join(f"{n / 8:.3f},{n % 2}\n" for n in range(70000))
-    (folder / "endless.csv").write_text(f"Time,S\n(ms),(V)\n{rows}")
-    code, _, err = command("verdict", "minutes.wav", *SCENE[1:3], "--secondary", "endless.csv", "--rated-power", "1")
-    assert code == 2
-    assert (
-        "endless.csv has 70000 samples (8.75 s), minutes.wav 71000 (8.88 s): an impulse response must be shorter" in err
-    )
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from comparisons.bench import Scene, StudyReport
 from comparisons.studies import cases, constraint
 from comparisons.studies.cases import Case, make_case
 from comparisons.studies.constraint import ClippedRow, ConstraintRow
-from comparisons.studies.rows import cell
 from kfopc_filterpy.paths import duct_plant
 
 TAPS = 16
@@ -110,11 +109,6 @@ def test_each_claim_is_of_its_own_rows() -> None:
     assert failed(good, ours=5.0, theirs=np.nan) == []  # what does not settle is slower
 
 
-def test_a_table_tells_of_a_diverged_run() -> None:
-    assert cell(clipped(), "noise_reduction_db") == 5.0
-    assert cell(clipped(diverged_at_s=0.3, noise_reduction_db=np.nan), "noise_reduction_db") == "diverged"
-
-
 # ---- The scenes
 
 
@@ -156,18 +150,6 @@ def test_a_case_is_what_it_says(scenes: Any, noise: str) -> None:
     np.testing.assert_allclose(scene.disturbances[0], d, rtol=0, atol=1e-12 * np.max(np.abs(d)))
     assert scene.sensor_noise_std**2 / np.mean(d[8000:] ** 2) == pytest.approx(1e-4, rel=1e-9)  # 40 dB below
     assert (scene.rated_power, scene.n_taps, scene.switch_on_s) == (1.0, 160, 0.5)
-
-
-def test_louder_scales_signals_powers_and_q_but_no_weights(scenes: Any) -> None:
-    scene = scenes["bursts"]
-    loud = cases.louder(scene, 4.0)
-    np.testing.assert_array_equal(loud.references[0], 4.0 * scene.references[0])
-    np.testing.assert_array_equal(loud.disturbances[0], 4.0 * scene.disturbances[0])
-    assert loud.sensor_noise_std == 4.0 * scene.sensor_noise_std
-    assert loud.measurement_noise == 16.0 * scene.measurement_noise
-    assert loud.unconstrained_power == 16.0 * scene.unconstrained_power
-    assert (loud.initial_variance, loud.rated_power) == (scene.initial_variance, scene.rated_power)
-    assert unconstrained_power(loud) == pytest.approx(16.0 * unconstrained_power(scene), rel=1e-9)
 
 
 def test_measured_data_join_where_they_are_at_hand(shared_data: Any, data_folder: Any) -> None:

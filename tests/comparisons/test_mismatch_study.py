@@ -46,15 +46,6 @@ def test_rows_are_those_of_plain_runs(small: Any, algorithm: str) -> None:
     assert row["power"] == pytest.approx(result.output_power / scene.rated_power, rel=1e-6)
 
 
-def test_tuning_with_the_exact_path_is_the_same_at_no_mismatch(small: Any) -> None:
-    rows = [r for r in small[0].extra["rows"] if r["amount"] == 0.0]
-    by_key: dict[Any, set[float]] = {}
-    for r in rows:
-        by_key.setdefault((r["noise"], r["algorithm"]), set()).add(r["noise_reduction_db"])
-    assert len(by_key) == 2 * len(STUDIED)
-    assert all(len(values) == 1 for values in by_key.values())
-
-
 # ---- Theory
 
 

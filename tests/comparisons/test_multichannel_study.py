@@ -11,12 +11,11 @@ import pytest
 from helpers.channels import through
 from helpers.studies import few_settings, plain_run, run_study, smaller
 
-from comparisons.bench import algorithms
 from comparisons.studies import multichannel
 from comparisons.studies import multichannel_rooms as rooms
 from comparisons.studies.multichannel import BOUND, KF_PB, SCALED, ChannelRow, claims
 from comparisons.studies.multichannel_rooms import MEASURED, Place, level_map_db
-from kfopc_filterpy import Plant, power_constrained_wiener
+from kfopc_filterpy import Plant
 
 KEPT = ("KF-PB", "FxLMS", "MOV-FxLMS", "clipping FxLMS", "leaky FxLMS")
 
@@ -71,30 +70,6 @@ def test_rows_are_what_a_run_by_hand_gives(small: Any) -> None:
         np.testing.assert_allclose(row["powers"], result.output_power / scene.rated_power, rtol=1e-6)
 
 
-def test_ratings_are_a_quarter_of_what_each_would_like(small: Any) -> None:
-    _, place = small
-    quarter = rooms.make_rated_scene(place, "compressor", 2.0)
-    equal = rooms.equally_rated(quarter)
-    np.testing.assert_allclose(quarter.rated_power, 0.25 * quarter.unconstrained_power)
-    np.testing.assert_allclose(equal.rated_power, np.mean(quarter.rated_power))
-    assert np.ptp(quarter.rated_power) > 0.0
-
-
-def test_bound_is_that_of_the_steady_half(small: Any) -> None:
-    report, place = small
-    scene = rooms.make_rated_scene(place, "compressor", 2.0)
-    bound = power_constrained_wiener(
-        scene.references[0],
-        place.plant,
-        n_taps=place.n_taps,
-        rated_power=scene.rated_power,
-        segment_s=2.0,
-        switch_on_s=scene.switch_on_s,
-    )
-    row = next(row for row in report.extra["rows"] if row["algorithm"] == BOUND and row["noise"] == "compressor")
-    assert row["noise_reduction_db"] == pytest.approx(bound.noise_reduction_over(1.0)["whole"], abs=1e-6)
-
-
 def test_level_map_is_the_sound_at_its_points() -> None:
     """Against paths to one point of the plane, computed and convolved on their own."""
     with smaller(rooms, MAP_SPACING_M=1.0):  # as above: the paths to the plane are kept
@@ -111,13 +86,6 @@ def test_level_map_is_the_sound_at_its_points() -> None:
     levels = [10 * np.log10(np.mean(sound[-n:] ** 2)) for sound in (quiet, played)]
     assert after[1, 4] - before[1, 4] == pytest.approx(levels[1] - levels[0], abs=1e-9)
     assert 10 * np.log10(np.mean(10 ** (before / 10))) == pytest.approx(0.0, abs=1e-9)
-
-
-def test_direct_forms_run_in_small_systems_only() -> None:
-    small, big = (Place(f"{n} x {n}", 128, Plant(np.ones((n, n, 64)), fs=4000), {}) for n in (2, 8))
-    direct = set(multichannel.DIRECT) & set(algorithms(several_channels=True))
-    assert direct <= set(multichannel.names(small))
-    assert not direct & set(multichannel.names(big))
 
 
 # ---- Claims

@@ -11,7 +11,7 @@ from helpers.studies import plain_run, run_study, short_duct, smaller
 from comparisons.studies import cases, tracking
 from comparisons.studies import tracking_events as events
 from comparisons.studies.tracking import TrackingRow
-from comparisons.studies.tracking_events import CHIRP_HZ, SWEEP_S, Event, change_scene, jump_scene, sweep
+from comparisons.studies.tracking_events import CHIRP_HZ, SWEEP_S, change_scene, sweep
 from kfopc_filterpy import Plant, convergence_time_s, noise_reduction_db
 from kfopc_filterpy.metrics import overshoot
 
@@ -80,16 +80,6 @@ def test_a_path_changes_at_its_sample(plant: Any) -> None:
     assert np.allclose(d[at:], -one[at:], atol=1e-12)
 
 
-def test_a_jump_is_of_the_reference(plant: Any) -> None:
-    scene = jump_scene(plant, 1, 20.0)
-    x = scene.references[0]
-    louder = slice(round(2.0 * FS), round(3.5 * FS))
-    usual = np.concatenate([x[: louder.start], x[louder.stop :]])
-    # 1.5 s of 800 Hz of band: power known to 1 / sqrt(2400), 2 %
-    assert np.mean(x[louder] ** 2) / np.mean(usual**2) == pytest.approx(100.0, rel=0.15)
-    assert scene.rated_power == pytest.approx(10**-0.3)
-
-
 def test_events_say_where_they_happen() -> None:
     found = {event.name: event for event in events.all_events()}
     assert list(found) == ["20 dB louder", "20 dB softer", "sign", "delay", "longer duct", "one sweep", "sweeps"]
@@ -97,14 +87,6 @@ def test_events_say_where_they_happen() -> None:
     names = [(event.name, path) for event, path in events.jobs({"duct": None, "measured duct": None})]
     assert len(names) == 13
     assert ("longer duct", "measured duct") not in names
-
-
-def test_an_algorithm_without_a_setting_is_lost() -> None:
-    event = Event("sign", lambda plant, seed: None, {"changed": (0.0, 1.0)})  # type: ignore[arg-type,return-value]
-    row, course = tracking.run_event(event, "duct", [], {"FxLMS": None}, "FxLMS")
-    assert (row.diverged_at_s, course) == (0.0, None)
-    assert np.isnan(row.noise_reduction_db)
-    assert row.settled_s == {"changed": None}
 
 
 def test_claims_from_rows_made_by_hand() -> None:

@@ -15,7 +15,6 @@ from comparisons.bench.tuning import AllDivergedError, Trial, best_setting, run_
 from kfopc_filterpy import HardClipAmplifier, Plant
 from kfopc_filterpy.controllers.core_controller import CoreController
 from kfopc_filterpy.paths import duct_plant
-from kfopc_filterpy.plot import curve_style
 from kfopc_filterpy.signals import band_limited_noise
 
 FS = 16000.0
@@ -166,10 +165,3 @@ def test_trials_are_means_over_seeds_and_one_divergence_is_all(scene: Scene) -> 
     assert best_setting(two, "FxLMS", [lost]) is None
     with pytest.raises(AllDivergedError, match=r"FxLMS diverged at every setting tried: \[0\.1\]"):
         tune(Runs(), two, ["FxLMS"], trials={"FxLMS": [lost]})
-
-
-def test_every_algorithm_has_a_style_that_no_other_has() -> None:
-    styles = {name: tuple(map(str, curve_style(name).values())) for name in REGISTRY}
-    assert len(set(styles.values())) == len(REGISTRY)
-    assert curve_style(7) == curve_style(1)
-    assert tuple(map(str, curve_style("KF-XYZ").values())) not in styles.values()

@@ -79,13 +79,6 @@ def test_a_controller_for_other_channels_is_refused(controller: Any, match: str)
         run(controller)
 
 
-def test_a_disturbance_of_other_microphones_is_refused() -> None:
-    with pytest.raises(
-        ValueError, match=r"disturbance must be \(K microphones, n_samples\) = \(3, 400\), got \(2, 400\)"
-    ):
-        simulate(Fixed(), X, Plant(SECONDARY, fs=FS), disturbance=np.zeros((2, N)))
-
-
 def test_a_control_signal_of_the_wrong_size_is_refused() -> None:
     class Wrong(Fixed):
         def control_signal(self, reference: np.ndarray) -> np.ndarray:

@@ -19,7 +19,6 @@ from kfopc_filterpy import (
 )
 from kfopc_filterpy.controllers import CoreController
 from kfopc_filterpy.filters import RandomWalkKFOPC
-from kfopc_filterpy.signals import Recording
 
 # ---- What is recorded
 
@@ -34,17 +33,6 @@ def test_the_result():
     np.testing.assert_allclose(result.anti_noise, np.convolve(result.amplifier_output, S)[: X.size], atol=1e-14)
     assert (result.algorithm, result.rated_power, result.diverged_at_s) == ("KF-OPC", 0.2, None)
     assert result.weights is result.weights_time_s is None  # not asked for
-
-
-def test_recordings_are_taken_as_they_were_read():
-    plain, recorded = (
-        simulate(MAKERS["KF-OPC"](), kind(X), PLANT, disturbance=kind(D)) for kind in (np.asarray, recording)
-    )
-    np.testing.assert_array_equal(plain.error, recorded.error)
-
-
-def recording(samples):
-    return Recording(samples, FS)
 
 
 @pytest.mark.parametrize("every", [1, 7, 299, 300, 1000])

@@ -9,7 +9,6 @@ from helpers.naming import plain
 from helpers.simulation import FS, MAKERS, PLANT, D, Integrator, S, Stepwise, X, constraint
 
 from kfopc_filterpy import KFOPC, KalmanController, Plant, fx_lms, simulate
-from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.controllers.kalman import KalmanInCore, kalman_settings
 from kfopc_filterpy.paths import fir_path
 from kfopc_filterpy.signals import Recording
@@ -51,11 +50,6 @@ def test_refused_with_nothing_changed(wrong, kind, message):
 def test_refuses_what_is_no_controller(wrong):
     with pytest.raises(TypeError, match=r"controller must have control_signal\(reference\) and update\(error\)"):
         simulate(wrong, X, PLANT, disturbance=D)
-
-
-def test_feedback_control_needs_the_disturbance():
-    with pytest.raises(ValueError, match="without a reference give disturbance="):
-        simulate(with_internal_model(MAKERS["FxLMS"]()), None, PLANT_AND_PRIMARY)
 
 
 def test_refuses_what_a_users_controller_cannot_do():

@@ -59,15 +59,6 @@ def test_loudspeakers_in_turn_are_a_problem_each():
     np.testing.assert_allclose(estimate_path(same, heard, N_TAPS, FS, regularization=0).taps, PATHS, atol=1e-9)
 
 
-def test_one_loudspeaker_and_several_microphones_or_the_other_way_round():
-    sent, heard = recordings()
-    several = estimate_path(sent[0], heard[0], N_TAPS, FS).taps
-    assert several.shape == (3, 1, N_TAPS)
-    np.testing.assert_array_equal(several[1, 0], estimate_path(sent[0], heard[0, 1], N_TAPS, FS).taps)
-    one, together = (estimate_path(sent, y, N_TAPS, FS).taps for y in (heard.sum(axis=0)[2], heard.sum(axis=0)))
-    np.testing.assert_allclose(one[0], together[2], atol=1e-12)
-
-
 @pytest.mark.parametrize("loudspeakers", ["in turn", "at once"])
 def test_noiseless_identification_is_exact(loudspeakers):
     settings = {"n_taps": N_TAPS, "duration_s": 0.5, "rng": 0, "loudspeakers": loudspeakers}

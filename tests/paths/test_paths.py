@@ -10,9 +10,7 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy import Plant
 from kfopc_filterpy._taps import path_taps, sampling_rate
-from kfopc_filterpy.paths import frequency_response
 from kfopc_filterpy.paths.models import bandpass_path, fir_path, perturbed_path
 
 FS = 16000.0
@@ -185,14 +183,3 @@ def test_perturbation_without_room_for_it_is_refused():
         perturbed_path([0.0, 1.0, 0.5], delay_samples=-3.0, fs=FS)
     advanced = path_taps(perturbed_path([0.0, 0.0, 0.0, 1.0, 0.5], delay_samples=-3.0, fs=FS))
     np.testing.assert_allclose(advanced[:2], [1.0, 0.5], atol=1e-10)
-
-
-def test_a_path_of_a_plant_with_one_channel_is_one_path():
-    plant = Plant([0.0, 1.0, 0.5], fs=8000)
-    np.testing.assert_array_equal(path_taps(plant.secondary), [0.0, 1.0, 0.5])
-    f = [0.0, 1000.0, 4000.0]
-    np.testing.assert_array_equal(
-        frequency_response(plant.secondary, f, fs=8000), frequency_response([0.0, 1.0, 0.5], f, fs=8000)
-    )
-    with pytest.raises(ValueError, match="one-dimensional"):
-        path_taps(np.ones((1, 2, 8)))

@@ -309,17 +309,6 @@ def test_the_rating_scales_everything() -> None:
         assert (limiter(100, factor**2).process(factor * u) / factor).tobytes() == expected.tobytes()
 
 
-def test_settings_can_be_read_and_the_window_is_in_seconds() -> None:
-    with_default = OutputLimiter(1.0, fs=FS)
-    with pytest.raises(AttributeError):
-        with_default.rated_power = 3.0  # type: ignore[misc]
-    assert with_default.rated_power == 1.0  # past outputs were limited to it
-    assert (with_default.fs, with_default.window_s, with_default.amplitude_limit) == (16000.0, 0.1, None)
-    assert with_default.state.laps.shape[1] - 1 == 1600
-    assert OutputLimiter(1.0, fs=48000, window_s=0.02).state.laps.shape[1] - 1 == 960
-    assert OutputLimiter(1.0, fs=1000, window_s=0.0016).state.laps.shape[1] - 1 == 2
-
-
 def test_reset_is_a_new_one() -> None:
     u = 3.0 * np.random.default_rng(5).normal(size=700)
     ours = limiter(100, amplitude_limit=5.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -127,16 +126,3 @@ def test_a_supervisor_that_is_saved_between_any_blocks_continues_to_the_bit(
     first, _ = states[0]
     np.testing.assert_array_equal(run(first, 5, BLOCKS), np.concatenate(ys[1:]))
     assert_same_contents(first, original)
-
-
-def test_the_health_record_goes_on_counting(tmp_path: Path) -> None:
-    supervisor, path = supervised("one channel"), tmp_path / "run.npz"
-    run(supervisor, 0, 20)
-    supervisor.save(path)
-    loaded, twin = Supervisor.load(path), deepcopy(supervisor)
-    for one in (loaded, twin):
-        one.note("output underflow")  # a kind that was not counted yet
-    assert loaded.health.counts["never"] == 0  # it counts, as before
-    assert repr(loaded) == repr(twin)
-    assert loaded.health.events == twin.health.events
-    assert loaded.health.events.maxlen == 1000

@@ -119,13 +119,6 @@ def test_a_filter_that_ends_before_the_noise_arrives_is_advised_how_long_it_must
     ]
 
 
-def test_nothing_is_reported_as_minus_zero():
-    verdict = verdict_on("filter", better=False)
-    nothing = replace(verdict, noise_reduction_db=-0.01, ceilings=replace(verdict.ceilings, filter_db=-0.01), advice=())
-    assert "reaches 0.0 dB" in repr(nothing)
-    assert "taps reach 0.0 dB" in repr(nothing)
-
-
 def test_without_a_primary_path_a_short_filter_is_advised_to_be_longer():
     verdict = on(disturbance=np.convolve(noise(), arriving(12, 30))[: noise().size], n_taps=8)
     assert verdict.limited_by == "filter"
