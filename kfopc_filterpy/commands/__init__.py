@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from .. import __version__
 from . import demo, export, paths, run, verdict
-from .options import WRONG_INPUT, Parser
+from .options import DONE, WRONG_INPUT, Parser
 from .printing import warn
 
 PIPE_CLOSED = 141  # as of a program that SIGPIPE ends
@@ -41,6 +41,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 done or enough, 1 not enough or stopped by a fault, 2 wrong input, 141 nobody reads the output.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments:
+        whole_parser().print_help()
+        return DONE
     options, unknown = whole_parser().parse_known_args(
         arguments, argparse.Namespace(command=shlex.join(["kfopc", *arguments]))
     )

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 
 import numpy as np
 
-from .._writing import made_folder
+from .._writing import made_folder, write_whole
 from .options import DONE, Parser, add_command
+from .printing import program
 
-FS, SECONDS = 16000, 10.0
+FS, SECONDS = 16000, 20.0
 MICROPHONE_NOISE = 0.005  # rms, beside a noise of 2 Pa rms
 PASCAL_PER_VOLT = 0.14  # of the loudspeaker in the duct
-VOLTS_PER_UNIT = 10.0
+VOLTS_PER_UNIT, WATT, OHM = 10.0, 50.0, 8.0
+RATED_POWER = WATT * OHM / VOLTS_PER_UNIT**2
+SETTINGS = f"""algorithm = "KF-OPC"
+n_taps = 128
+secondary = "S.wav"
+rated_power = {RATED_POWER:g}
+state_noise = 3.5e-9
+measurement_noise = 0.6
+[limiter]
+rated_power = {RATED_POWER:g}
+"""
 EXAMPLES = """example:
   kfopc demo demo"""
 
@@ -21,16 +33,20 @@ EXAMPLES = """example:
 def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     """Add the subcommand."""
     parser = add_command(commands, "demo", demo, "write files on which the other commands can be tried", EXAMPLES)
-    parser.add_argument("folder", type=Path, help="folder for noise.wav, d.wav, P.wav and S.wav")
+    about = "folder for noise.wav, d.wav, P.wav, S.wav, controller.toml and trained.npz"
+    parser.add_argument("folder", type=Path, help=about)
 
 
 def demo(options: argparse.Namespace) -> int:
-    """Write a reference, a disturbance and both paths: a compressor at 100 dB SPL in a duct."""
+    """Write a reference, a disturbance, both paths and a controller: a compressor at 100 dB SPL in a duct."""
+    from .. import Plant, simulate
     from ..paths import duct_plant
-    from ..signals import compressor_noise, write_wav
+    from ..signals import Compressor, compressor_noise, write_wav
+    from .export import described
 
     duct, rng = duct_plant(fs=FS), np.random.default_rng(7)
-    sound = compressor_noise(SECONDS, fs=FS, rng=7, power=2.0**2)  # in Pa
+    flow = Compressor(bandwidth_hz=FS / 2)  # whose noise falls by 6 dB per octave
+    sound = compressor_noise(SECONDS, flow, fs=FS, rng=7, power=2.0**2)  # in Pa
     primary, secondary = duct.primary[0, 0], duct.secondary[0, 0]  # type: ignore[index]
     signals = {
         "noise": sound + MICROPHONE_NOISE * rng.standard_normal(sound.size),
@@ -39,15 +55,27 @@ def demo(options: argparse.Namespace) -> int:
         "S": VOLTS_PER_UNIT * PASCAL_PER_VOLT * secondary,
     }
     files = {options.folder / f"{name}.wav": signal for name, signal in signals.items()}
-    if there := [str(path) for path in files if path.exists()]:
+    settings, trained = options.folder / "controller.toml", options.folder / "trained.npz"
+    if there := [str(path) for path in (*files, settings, trained) if path.exists()]:
         raise FileExistsError(f"{', '.join(there)} would be overwritten: choose another folder")
     made_folder(options.folder)
     for path, signal in files.items():
         write_wav(path, signal, FS)
-    noise, d, primary_file, secondary_file = files
-    print(f"{noise}, {d}, {primary_file} and {secondary_file} written. For example:")
-    print(
-        f"kfopc verdict {noise} --primary {primary_file} --secondary {secondary_file} --watt 50 --ohm 8 "
-        f"--volts-per-unit {VOLTS_PER_UNIT:g} -o {options.folder / 'out'}"
-    )
+    write_whole(settings, SETTINGS)
+    as_stated = argparse.Namespace(fs=None, file_fs=None, channel=None, variable=None)
+    controller, _ = described(settings, as_stated)
+    learned = slice(0, int(5 * FS))
+    simulate(controller, signals["noise"][learned], Plant(signals["S"], fs=FS), disturbance=signals["d"][learned])
+    controller.save(trained)
+    noise, _, *paths = (shlex.quote(str(path)) for path in files)
+    scene = f"{noise} --primary {paths[0]} --secondary {paths[1]}"
+    folder, kfopc = options.folder, program()
+    print(f"noise.wav, d.wav, P.wav, S.wav, controller.toml and trained.npz written into {folder}. For example:")
+    for command in (
+        f"verdict {scene} --watt {WATT:g} --ohm {OHM:g} --volts-per-unit {VOLTS_PER_UNIT:g} -o "
+        + shlex.quote(str(folder / "out")),
+        f"run {scene} --rated-power {RATED_POWER:g} --block 16",
+        f"export {shlex.quote(str(trained))} -o {shlex.quote(str(folder / 'firmware'))} --dtype float32",
+    ):
+        print(f"{kfopc} {command}")
     return DONE

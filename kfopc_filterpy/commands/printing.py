@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+
+def program() -> str:
+    """Return how this program is called here, for the commands that it prints."""
+    called = sys.argv[0]
+    if Path(called).name == "__main__.py":
+        return f"{shlex.quote(sys.executable)} -m kfopc_filterpy"
+    return shlex.quote(called) if Path(called).stem == "kfopc" and not shutil.which("kfopc") else "kfopc"
 
 
 def warn(options: argparse.Namespace, message: str, kind: str = "warning") -> None:

@@ -27,6 +27,7 @@ from kfopc_filterpy.bounds.wiener import mean_square, reduction_db
 from kfopc_filterpy.controllers.kf_pb import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.metrics import (
     a_weighted_level_db,
+    a_weighting_db,
     convergence_time_s,
     overshoot,
     peak_control_signal,
@@ -46,7 +47,7 @@ from kfopc_filterpy.plant import Plant, as_constant_plant, checked_signals
 from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_remarks
 
 from .._types import ProgressBar
-from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on
+from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on, nominal_hz
 from .candidates import CANDIDATES, CHOSEN, DIRECT, ONE_CHANNEL, Settings
 from .fixed_filters import FixedFilters, longest_filter
 from .limits import (
@@ -68,7 +69,8 @@ WEAK_DB = -20.0  # gain of the secondary path, over its mean in the noise's band
 LEAST_RUN_S = 2.0  # its second half then has ten of an amplifier's windows of 0.1 s
 LEAST_TOLERANCE = 0.01  # of the least rated power
 SAME_DB, KEPT = 0.1, 1.02  # runs that differ by less are as good, and a rating that is exceeded by less is kept
-LOUDER_DB, HEARD_DB = 1.0, 40.0  # of a third octave: by how much, and how far below the loudest one at most
+MOST_BANDS = 3  # that a note names
+LOUDER_DB, HEARD = 1.0, 1e-3  # of a third octave: by how much, and its least share of the A-weighted power that remains
 DIFFERING_DB = -6.0  # left of a recorded disturbance by a primary path, from which a note says so
 NEARLY_FREE = 1e6  # times the power of the bound: an amplifier without limits
 
@@ -525,14 +527,18 @@ def _on_louder_bands(run: SimulationResult) -> list[str]:
         (centres, before), (_, after) = (third_octave_levels_db(one, run.fs) for one in (run.disturbance, run.error))
     except ValueError:  # none is below half of such a low rate
         return []
-    more = np.subtract(after, before, where=after > np.max(before) - HEARD_DB, out=np.zeros_like(after))
-    more = np.atleast_2d(more).max(axis=0)
-    count, most = np.count_nonzero(more > LOUDER_DB), np.argmax(more)
-    if not count:
+    power = 10 ** (np.atleast_2d(after + a_weighting_db(centres)) / 10)
+    share = power / power.sum(axis=1, keepdims=True)  # at each microphone
+    more = np.where(share > HEARD, after - before, 0.0).max(axis=0)
+    louder = sorted(np.flatnonzero(more > LOUDER_DB), key=lambda band: -share[:, band].max())
+    if not louder:
         return []
+    each = zip(map(nominal_hz, centres), more, share.max(axis=0), strict=True)
+    named = [f"{centre} Hz by {db:.1f} dB ({own:.1%})" for centre, db, own in each]
+    first = (named[band] for band in louder[:MOST_BANDS])
     return [
-        f"{run.algorithm} makes {count} of {more.size} third octaves louder, most of all the one at {centres[most]:.0f} Hz: "
-        f"by {more[most]:.1f} dB."
+        f"{run.algorithm} makes {len(louder)} of {more.size} third octaves louder: {', '.join(first)}"
+        f"{' and others' if len(louder) > MOST_BANDS else ''}; in brackets, their share of the A-weighted power that remains."
     ]
 
 
@@ -576,6 +582,12 @@ def _levels(run: SimulationResult, pascal: Any) -> SoundLevels:
     )
 
 
+def _a_weighted_db(signals: np.ndarray, fs: float) -> float:
+    """Return the A-weighted level of all microphones together; NaN for a run that diverged."""
+    levels = np.array(a_weighted_level_db(signals, fs, reference=1.0))
+    return 10.0 * float(np.log10(np.sum(10 ** (levels / 10))))
+
+
 def _figures(run: SimulationResult, limits: Limits, fs: float, settings: Settings) -> dict[str, Any]:
     """Return the figures of merit of a run and its settings; with several channels also of each microphone."""
     several = isinstance(limits, ChannelLimits)  # also if only the references are several
@@ -584,6 +596,7 @@ def _figures(run: SimulationResult, limits: Limits, fs: float, settings: Setting
     power = output_power(y)
     figures = {
         "noise_reduction_db": noise_reduction_db(e, d),
+        "noise_reduction_dba": _a_weighted_db(d, fs) - _a_weighted_db(e, fs),
         "output_power": power,
         "of_rated_power": power / limits.rated_power,
         "worst_window": overshoot(y, limits.rated_power, fs, window_s=limits.window_s),

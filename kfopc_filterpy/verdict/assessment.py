@@ -222,8 +222,9 @@ class Assessment:
         missed = self.noise_reduction_db - self.want_db
         if not np.isfinite(missed):
             return f"{answer}: {self.algorithm} diverges with {self.power(self.limits.rated_power)}."
+        weighted = _db(self.figures[self.algorithm]["noise_reduction_dba"])
         return (
-            f"{answer}: {self.algorithm} reaches {_db(self.noise_reduction_db)} with "
+            f"{answer}: {self.algorithm} reaches {_db(self.noise_reduction_db)} ({weighted} A-weighted) with "
             f"{self.power(self.limits.rated_power)}, "
             f"{abs(missed):.1f} dB {'more' if missed >= 0 else 'less'} than the {self.want_db:g} dB wanted, in a run of "
             f"{self.runs[self.algorithm].n_samples / self.fs:.3g} s."
@@ -340,6 +341,12 @@ def _each(values: Any, form: str, unit: str = "", all_the_same: str = " each") -
     if np.ndim(values) and len(set(texts)) == 1:
         return f"{texts[0]}{unit}{all_the_same if len(texts) > 1 else ''}"
     return f"{', '.join(texts)}{unit}"
+
+
+def nominal_hz(centre: float) -> str:
+    """Return a third octave's nominal centre frequency: the exact one to the preferred digits."""
+    digits = (1, 1.25, 1.6, 2, 2.5, 3.15, 4, 5, 6.3, 8)[round(10 * np.log10(centre)) % 10]
+    return f"{digits * 10 ** np.floor(np.log10(centre) + 1e-6):g}"
 
 
 def _db(value: float) -> str:

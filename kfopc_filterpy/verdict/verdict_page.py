@@ -17,6 +17,7 @@ from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_
 from kfopc_filterpy.plot.style import new_axes
 
 from .._writing import write_whole
+from .assessment import nominal_hz
 from .items import FigureItem, Sound, Table, write_files
 from .page import images, players, rendered
 
@@ -160,17 +161,11 @@ def _draw_bands(levels: SoundLevels, microphone: int, ax: Any) -> None:
         (0.2, after_db, "with control", curve_style("KF-OPC")["color"]),
     ):
         ax.bar(places + offset, np.maximum(values - floor, 0.0), 0.4, bottom=floor, label=label, color=colour)
-    ax.set_xticks(places[::3], [_nominal(f) for f in centres_hz[::3]])
+    ax.set_xticks(places[::3], [nominal_hz(f) for f in centres_hz[::3]])
     ax.set_xlabel("Third-octave band (Hz)")
     ax.set_ylabel("Level (dB re 20 µPa)")
     ax.grid(True, axis="y", alpha=0.25)
     ax.legend(fontsize="small")
-
-
-def _nominal(centre: float) -> str:
-    """Return a third octave's nominal centre frequency: the exact one to the preferred digits."""
-    digits = (1, 1.25, 1.6, 2, 2.5, 3.15, 4, 5, 6.3, 8)[round(10 * np.log10(centre)) % 10]
-    return f"{digits * 10 ** np.floor(np.log10(centre) + 1e-6):g}"
 
 
 def _sounds(verdict: Assessment) -> Iterator[Sound]:
@@ -214,7 +209,7 @@ def _tables(verdict: Assessment) -> Any:
         headings = ["Microphone", "Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"]
         pairs = zip(np.atleast_2d(levels.before_db), np.atleast_2d(levels.after_db), strict=True)
         rows = [
-            [str(k), _nominal(centre), float(before), float(after), float(before - after)]
+            [str(k), nominal_hz(centre), float(before), float(after), float(before - after)]
             for k, (before_db, after_db) in enumerate(pairs, 1)
             for centre, before, after in zip(levels.centres_hz, before_db, after_db, strict=True)
         ]
@@ -227,6 +222,7 @@ def algorithms_table(verdict: Assessment) -> Table:
     volts = verdict.volts_per_unit
     columns = [
         ("Noise reduction (dB)", "noise_reduction_db", None),
+        ("A-weighted (dB)", "noise_reduction_dba", None),
         (_power_label(verdict), "output_power", verdict.watt_per_power),
         ("Power / rated power", "of_rated_power", None),
         ("Worst window", "worst_window", None),

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+import sys
 from inspect import signature
 from pathlib import Path
 
@@ -46,7 +47,7 @@ def test_a_process_ends_with_0_if_the_amplifier_is_enough_and_writes_what_it_say
 
 
 @pytest.mark.slow
-def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(inside, capsys):
+def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(inside, capsys, monkeypatch):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     lines = text.splitlines()
     start = next(number for number, line in enumerate(lines) if "kfopc demo" in line and line.startswith(".venv"))
@@ -63,8 +64,24 @@ def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(inside, cap
     watt = re.search(r"About (\S+) W into 8 ohm would do", printed)[1]
     typed_back = " ".join(pasted[1:-2]).replace("--watt 50", f"--watt {watt}").replace("--primary P", "--disturbance d")
     assert main(typed_back.split()) == 0  # d.wav is what P.wav makes of noise.wav, and some noise of the microphone
-    assert main(["demo", "."]) == 2
-    assert "S.wav would be overwritten: choose another folder" in capsys.readouterr().err
+    os.chdir("..")
+    monkeypatch.setattr(sys, "argv", ["my venv/bin/kfopc"])
+    monkeypatch.setenv("PATH", "")
+    capsys.readouterr()
+    assert main(["demo", "my files"]) == 0
+    _, *commands = capsys.readouterr().out.splitlines()
+    assert [shlex.split(command)[:2] for command in commands] == [
+        ["my venv/bin/kfopc", one] for one in ("verdict", "run", "export")
+    ]
+    for command in commands[1:]:  # the verdict is the one above
+        assert main(shlex.split(command)[1:]) == 0
+    assert float(re.search(r"noise reduction (\S+) dB", capsys.readouterr().out)[1]) > 12.0
+    assert Path("my files", "firmware", "anc.c").is_file()
+    assert main(["demo", "my files"]) == 2
+    assert (
+        "S.wav, my files/controller.toml, my files/trained.npz would be overwritten: choose another folder"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_process_ends_with_1_if_it_is_not_and_reads_its_standard_input(folder):

@@ -15,6 +15,7 @@ import pytest
 from scipy.signal import firwin, welch
 
 from kfopc_filterpy import Plant, __version__
+from kfopc_filterpy.metrics import a_weighting_db
 from kfopc_filterpy.power import AmplifierRating
 from kfopc_filterpy.signals import Recording, band_limited_noise
 from kfopc_filterpy.verdict import assess
@@ -265,14 +266,23 @@ def test_a_third_octave_that_the_control_makes_louder_is_noted():
     x = np.random.default_rng(0).standard_normal(3 * FS)
     verdict = on(x, firwin(41, [400, 900], pass_zero=False, fs=FS), arriving(8, length=16))
     note = next(note for note in verdict.notes if "third octaves louder" in note)
-    count, centre, more = re.match(r"KF-PB makes (\d+) of \d+ .* at (\d+) Hz: by ([\d.]+) dB\.", note).groups()
+    count, centre, more, share = re.match(
+        r"KF-PB makes (\d+) .*?: (\d+) Hz by ([\d.]+) dB \(([\d.]+)%\)", note
+    ).groups()
     run = verdict.runs["KF-PB"]
     half = np.array([run.error, run.disturbance])[:, run.n_samples // 2 :]
     f, spectra = welch(half, FS, nperseg=2048)
-    band = (f > int(centre) * 2 ** (-1 / 6)) & (f < int(centre) * 2 ** (1 / 6))
-    after, before = spectra[:, band].sum(axis=1)
-    assert float(more) == pytest.approx(10 * np.log10(after / before), abs=1.0)  # their filters' flanks differ
+    exact = 1000 * 10 ** (round(10 * np.log10(int(centre) / 1000)) / 10)
+    band = 1 / (1 + ((f[1:] / exact - exact / f[1:]) / (10**0.05 - 10**-0.05)) ** 8)  # of a Butterworth band-pass
+    after, before = spectra[:, 1:] @ band
+    assert float(more) == pytest.approx(10 * np.log10(after / before), abs=1.0)  # Welch smears a steep edge
     assert int(count) > 1
+    weighted = spectra[:, 1:] * 10 ** (a_weighting_db(f[1:]) / 10)
+    assert float(share) == pytest.approx(100 * weighted[0] @ band / weighted[0].sum(), rel=0.1)
+    less = 10 * np.log10(weighted[1].sum() / weighted[0].sum())
+    own = verdict.figures["KF-PB"]["noise_reduction_dba"]
+    assert own == pytest.approx(less, abs=0.3)
+    assert f"({own:.1f} dB A-weighted)" in verdict.verdict
     assert not any("louder" in note for note in on().notes)
 
 
