@@ -93,10 +93,7 @@ def test_coherence_bound_is_the_incoherent_share():
             lambda x, d, plant: wiener_solution(0 * x, plant, n_taps=4, disturbance=d),
             "reference through the secondary path must not be silent",
         ),
-        (
-            lambda x, d, plant: wiener_solution(x, plant, n_taps=4, disturbance=0 * d),
-            "disturbance must not be silent",
-        ),
+        (lambda x, d, plant: wiener_solution(x, plant, n_taps=4, disturbance=0 * d), "disturbance must not be silent"),
         (
             lambda x, d, plant: wiener_solution(x, plant, n_taps=4, disturbance=d, regularization=-1),
             "regularization must not be negative",

@@ -91,10 +91,7 @@ def test_an_error_is_one_line_that_says_what_to_do(command, arguments):
     assert err.startswith("kfopc")
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [[], ["verdict"], ["paths"], ["paths", "identify"]],
-)
+@pytest.mark.parametrize("arguments", [[], ["verdict"], ["paths"], ["paths", "identify"]])
 def test_help_says_what_it_does_and_shows_an_example(command, arguments):
     code, out, _ = command(*arguments, "--help")
     assert code == 0

@@ -10,14 +10,7 @@ from helpers.studies import run_study, smaller
 
 from comparisons.bench import StudyReport
 from comparisons.studies import uncertain_path
-from comparisons.studies.uncertain_path import (
-    DEFAULT,
-    IDENTIFIED,
-    NOTHING,
-    STATED,
-    AllowanceRow,
-    seconds_db,
-)
+from comparisons.studies.uncertain_path import DEFAULT, IDENTIFIED, NOTHING, STATED, AllowanceRow, seconds_db
 from kfopc_filterpy import Plant, SimulationResult, simulate
 
 PLANT = Plant([0.0, 0.0, 0.0, 1.0, -0.6], [0.0] * 8 + [0.8, 0.4], fs=16000)

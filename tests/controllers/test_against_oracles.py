@@ -117,12 +117,7 @@ LMS: dict[str, Algorithm] = {
     "leaky": (leaky_fx_lms, lms.LeakyFxLMS, {"step_size": MU, "leak": LEAK}, {"mu": MU, "gamma": LEAK}),
     "optimal leaky": (optimal_leaky_fx_lms, lms.OptimalLeakyFxLMS, {"step_size": MU}, {"mu": MU}),
     "MOV": (mov_fx_lms, lms.MOVFxLMS, {"step_size": MU}, {"mu": MU}),
-    "MOV fixed": (
-        mov_fx_lms,
-        lms.MOVFxLMS,
-        {"step_size": MU, "penalty_factor": PENALTY},
-        {"mu": MU, "gamma": PENALTY},
-    ),
+    "MOV fixed": (mov_fx_lms, lms.MOVFxLMS, {"step_size": MU, "penalty_factor": PENALTY}, {"mu": MU, "gamma": PENALTY}),
     "MOV modified": (mov_fx_lms, lms.MOVFxLMS, {"step_size": MU, "modified": True}, {"mu": MU, "modified": True}),
     "two-gradient": (
         two_gradient_fx_lms,
@@ -152,7 +147,7 @@ SEVERAL_KALMAN: dict[str, Algorithm] = {  # several channels, too
     "diagonal KF-OPC": (diagonal_kf, DiagonalOracle, *ONE_NOISE),
 }
 KALMAN: dict[str, Algorithm] = SEVERAL_KALMAN | {
-    "FxRLS": (fx_rls, FxRLS, {"forgetting": LAMBDA}, {"forgetting": LAMBDA}),
+    "FxRLS": (fx_rls, FxRLS, {"forgetting": LAMBDA}, {"forgetting": LAMBDA})
 }
 ALGORITHMS = LMS | KALMAN
 WITH_POWERS = [name for name in ALGORITHMS if name.startswith(("optimal", "MOV")) or name.endswith("KF-OPC")]

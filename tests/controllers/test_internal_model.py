@@ -12,24 +12,10 @@ from helpers.controllers import KALMAN, MANY, PATHS, SEVERAL, VARIANTS, K, const
 from helpers.loop import AMPLIFIERS, FS, MU, N_TAPS, S_HAT, N, S, noises, run
 from scipy.signal import lfilter
 
-from kfopc_filterpy import (
-    KFOPC,
-    KalmanController,
-    Plant,
-    fx_lms,
-    kf_anc,
-    kf_opc,
-    kf_pb,
-    simulate,
-)
+from kfopc_filterpy import KFOPC, KalmanController, Plant, fx_lms, kf_anc, kf_opc, kf_pb, simulate
 from kfopc_filterpy.bounds import power_constrained_solution, predictor_reference, wiener_solution
 from kfopc_filterpy.checkpoint import content_of
-from kfopc_filterpy.controllers import (
-    FeedbackNeutralizer,
-    RefusedUpdate,
-    VirtualMicrophones,
-    with_internal_model,
-)
+from kfopc_filterpy.controllers import FeedbackNeutralizer, RefusedUpdate, VirtualMicrophones, with_internal_model
 from kfopc_filterpy.realtime import Supervisor
 
 D = noises()[1]

@@ -14,12 +14,7 @@ from helpers.loop import AMPLIFIERS, FEEDBACK, FS, S_HAT, N, noises
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy import (
-    LimitedController,
-    OutputLimiter,
-    Plant,
-    simulate,
-)
+from kfopc_filterpy import LimitedController, OutputLimiter, Plant, simulate
 
 RATED_POWER, WINDOW = 0.05, 80  # of the limiter; the window in samples
 NAMES = ("KF-ANC", "KF-OPC", "KF-PB", "FxLMS", "MOV")

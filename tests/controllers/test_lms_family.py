@@ -84,10 +84,7 @@ def statistics(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     [
         (lambda mu: leaky_fx_lms(L, PATH, step_size=mu, leak=0.5), lambda R_x: 0.5 * np.eye(L)),
         (lambda mu: mov_fx_lms(L, PATH, step_size=mu, penalty_factor=0.6), lambda R_x: 0.6 * R_x),
-        (
-            lambda mu: mov_fx_lms(L, PATH, step_size=mu, penalty_factor=0.6, modified=True),
-            lambda R_x: 0.6 * R_x,
-        ),
+        (lambda mu: mov_fx_lms(L, PATH, step_size=mu, penalty_factor=0.6, modified=True), lambda R_x: 0.6 * R_x),
     ],
     ids=["leaky", "MOV", "MOV modified"],
 )

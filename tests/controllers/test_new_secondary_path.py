@@ -12,14 +12,7 @@ from helpers.checkpoints import Room
 from helpers.controllers import IN_BLOCKS, KALMAN, MAKERS, PATHS, SEVERAL, J, K
 from helpers.loop import FS, MU, N_TAPS, S_HAT, noises
 
-from kfopc_filterpy import (
-    KalmanController,
-    OutputPowerConstraint,
-    diagonal_kf,
-    fx_lms,
-    kf_anc,
-    kf_opc,
-)
+from kfopc_filterpy import KalmanController, OutputPowerConstraint, diagonal_kf, fx_lms, kf_anc, kf_opc
 from kfopc_filterpy.paths import PathTolerance, fir_path
 
 NEW = np.array([0.0, 0.0, -0.7, 0.2])

@@ -82,10 +82,7 @@ class Patient(Gate):
 
 @pytest.mark.parametrize(
     "wrap",
-    [
-        lambda own: LimitedController(own, OutputLimiter(4.0, fs=FS)),
-        lambda own: FeedbackNeutralizer(own, [0.0, 0.1]),
-    ],
+    [lambda own: LimitedController(own, OutputLimiter(4.0, fs=FS)), lambda own: FeedbackNeutralizer(own, [0.0, 0.1])],
 )
 def test_a_second_thread_is_refused_by_a_wrapper_of_ones_own_controller(wrap: Any) -> None:
     own, answers = Patient(), []

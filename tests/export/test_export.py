@@ -324,11 +324,7 @@ def test_a_large_initial_variance_is_no_harm_in_float32(ratio, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "dtype", "large"),
-    [
-        ("FxLMS", "float64", 1e200),
-        ("MOV, everything", "float32", 1e30),
-        ("KF-OPC, everything", "float64", 1e200),
-    ],
+    [("FxLMS", "float64", 1e200), ("MOV, everything", "float32", 1e30), ("KF-OPC, everything", "float64", 1e200)],
 )
 def test_a_bad_error_is_refused_and_a_bad_reference_counts_as_zero(name, dtype, large, tmp_path):
     """Python's controller, which gets zeros for the bad values and does not adapt to them, goes on alike."""
@@ -368,11 +364,7 @@ def test_a_control_signal_that_overflows_is_silent_and_its_update_is_refused(dty
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype"),
-    [
-        ("KF-OPC, everything", "float64"),
-        ("KF-OPC, large initial variance", "float32"),
-    ],
+    ("name", "dtype"), [("KF-OPC, everything", "float64"), ("KF-OPC, large initial variance", "float32")]
 )
 def test_sanitizers_find_nothing(name, dtype, tmp_path):
     options = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -460,8 +452,7 @@ def test_complex_h_may_come_first_and_the_source_refuses_to_be_cpp(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype", "command"),
-    [("KF-OPC, limited", "float64", "gcc"), ("KF-PB, everything", "float32", "clang")],
+    ("name", "dtype", "command"), [("KF-OPC, limited", "float64", "gcc"), ("KF-PB, everything", "float32", "clang")]
 )
 def test_the_example_in_a_folder_runs(name, dtype, command, tmp_path):
     folder = tmp_path / "firmware"
@@ -484,8 +475,7 @@ __attribute__((destructor)) static void tell(void) { fprintf(stderr, "%ld", mult
 
 
 @pytest.mark.parametrize(
-    ("name", "everything"),
-    [*((name, True) for name in [*ALGORITHMS, "KF-PB"]), ("FxLMS", False), ("KF-OPC", False)],
+    ("name", "everything"), [*((name, True) for name in [*ALGORITHMS, "KF-PB"]), ("FxLMS", False), ("KF-OPC", False)]
 )
 def test_the_readme_states_how_many_multiplications_a_sample_takes(name, everything, tmp_path):
     """LLVM compiles for a machine that counts them: within 3 %, or 5 of them, because small terms are left out."""

@@ -32,12 +32,7 @@ from kfopc_filterpy import (
     rescaling_fx_lms,
     two_gradient_fx_lms,
 )
-from kfopc_filterpy.controllers import (
-    FeedbackNeutralizer,
-    KalmanObserver,
-    VirtualMicrophones,
-    with_internal_model,
-)
+from kfopc_filterpy.controllers import FeedbackNeutralizer, KalmanObserver, VirtualMicrophones, with_internal_model
 from kfopc_filterpy.paths import PathTolerance
 
 KALMAN: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}

@@ -14,14 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kfopc_filterpy import (
-    Plant,
-    bandpass_path,
-    kf_anc,
-    kf_opc,
-    simulate,
-    suggest_settings,
-)
+from kfopc_filterpy import Plant, bandpass_path, kf_anc, kf_opc, simulate, suggest_settings
 from kfopc_filterpy.bounds import SuggestedSettings, wiener_solution
 from kfopc_filterpy.paths import duct_plant
 from kfopc_filterpy.signals import (
@@ -96,12 +89,7 @@ def silent_run(x: np.ndarray, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
 
 
 def compare(
-    plant: Plant,
-    noise: Noise,
-    *,
-    duration: float,
-    lengths: Sequence[int],
-    factors: Sequence[float],
+    plant: Plant, noise: Noise, *, duration: float, lengths: Sequence[int], factors: Sequence[float]
 ) -> Comparison:
     """Suggest settings from one run of the noise, and compare them on another with a grid.
 

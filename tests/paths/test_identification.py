@@ -9,11 +9,7 @@ import scipy.signal
 from scipy.signal import fftconvolve, lfilter
 
 from kfopc_filterpy import Plant
-from kfopc_filterpy.paths.identification import (
-    estimate_path,
-    identify_secondary_path,
-    misalignment_db,
-)
+from kfopc_filterpy.paths.identification import estimate_path, identify_secondary_path, misalignment_db
 from kfopc_filterpy.paths.models import bandpass_path
 from kfopc_filterpy.paths.uncertainty import path_uncertainty
 

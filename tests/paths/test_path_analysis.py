@@ -12,11 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from kfopc_filterpy import Plant
 from kfopc_filterpy.paths import causality_margin
-from kfopc_filterpy.paths.analysis import (
-    achieved_band,
-    frequency_response,
-    secondary_path_gain,
-)
+from kfopc_filterpy.paths.analysis import achieved_band, frequency_response, secondary_path_gain
 from kfopc_filterpy.paths.models import bandpass_path, fir_path
 
 FS = 16000.0

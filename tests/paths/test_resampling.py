@@ -6,12 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from kfopc_filterpy.paths import (
-    fir_path,
-    frequency_response,
-    path_taps,
-    resample_path,
-)
+from kfopc_filterpy.paths import fir_path, frequency_response, path_taps, resample_path
 
 RATES = [(44100, 16000), (48000, 16000), (16000, 8000), (16000, 44100), (16000, 48000), (12000, 16000), (44101, 48000)]
 
