@@ -36,8 +36,12 @@ collect_ignore = ["signals/fuzz_readers.py"]  # a program, which needs atheris
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A headless Chromium with a profile of its own; without one, the test is skipped."""
+    """A headless Chromium with a profile of its own; without one, the test is skipped.
+
+    Its `until(condition)` waits for what a page does, as long as that takes on a busy machine.
+    """
     webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium (the extra `test`)")
+    pytest.importorskip("selenium.webdriver.support.wait")
     binary = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     driver = shutil.which("chromedriver")
     if binary is None or driver is None:
@@ -56,7 +60,8 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     chromium = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
-    chromium.set_script_timeout(120.0)
+    chromium.set_script_timeout(600.0)
+    chromium.until = webdriver.support.wait.WebDriverWait(chromium, 600.0).until
     yield chromium
     chromium.quit()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +23,7 @@ from kfopc_filterpy.realtime import (
     RunStatus,
     SimulatedInterface,
     SoundDevice,
+    interfaces,
     measure_round_trip,
     run,
 )
@@ -63,18 +63,30 @@ def started(interface: Interface, step_size: float = 2e-3, **changed: Any) -> An
     return run(lambda path: fx_lms(24, path.taps, step_size=step_size), interface, **settings | changed)
 
 
-def test_a_real_clock_waits_for_the_blocks_and_loses_those_not_fetched() -> None:
+class Clock:
+    """Stands for the module `time`: its time passes only while somebody sleeps."""
+
+    now = 100.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+def test_a_real_clock_waits_for_the_blocks_and_loses_those_not_fetched(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    monkeypatch.setattr(interfaces, "time", clock)
     interface = plant(block=400, latency=400, clock="real")  # 50 ms
-    began = time.perf_counter()
     interface.start()
-    for _ in range(4):
-        block = interface.read()
-        assert block is not None
-    assert time.perf_counter() - began >= 0.2
-    time.sleep(0.27)
-    late = interface.read()
-    assert late is not None
-    assert late.lost >= 1600
+    assert [interface.read().lost for _ in range(4)] == [0, 0, 0, 0]
+    assert clock.now == pytest.approx(100.2)
+    clock.sleep(0.27)  # to the middle of the tenth block: the last of five that were heard meanwhile is fetched
+    assert interface.read().lost == 4 * 400
+    assert clock.now == pytest.approx(100.47)  # no wait
+    interface.read()
+    assert clock.now == pytest.approx(100.5)
 
 
 def test_a_run_identifies_fades_in_reduces_and_fades_out() -> None:
