@@ -78,28 +78,6 @@ def test_what_is_saved_or_copied_continues_to_the_bit(name: str, samples: int, t
         assert_same_contents(twin, made)
 
 
-def test_a_second_process_continues_to_the_bit(tmp_path: Path) -> None:
-    script = """
-import sys, numpy as np
-from kfopc_filterpy.controllers import CoreController
-controller = CoreController.load(sys.argv[1])
-x, d = np.random.default_rng(0).standard_normal((2, 300))
-for n in range(117, 300):
-    y = controller.control_signal(x[n])
-    controller.update(d[n] - y)
-controller.save(sys.argv[1])
-"""
-    path = tmp_path / "run.npz"
-    controller = kf_opc(8, [0.0, 1.0], rated_power=0.1, fs=8000, state_noise=1e-6, measurement_noise=0.1)
-    for n, (x, d) in enumerate(np.random.default_rng(0).standard_normal((2, 300)).T):
-        if n == 117:
-            controller.save(path)
-        y = controller.control_signal(x)
-        controller.update(d - y)
-    subprocess.run([sys.executable, "-c", script, str(path)], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
-    assert_same_contents(CoreController.load(path), controller)
-
-
 def leaves(kind: type) -> set[type]:
     """Return the package's classes under this one from which no other is derived."""
     derived = [one for one in kind.__subclasses__() if one.__module__.startswith("kfopc_filterpy.")]

@@ -144,30 +144,27 @@ def test_without_any_noise_of_a_microphone_q_is_60_db_down():
 # ---- What it says
 
 
-def test_it_says_what_limits_the_length():
-    x, d = long_tail()
-    assert "as long as max_taps allows" in suggest_settings(x, PLANT, disturbance=d, max_taps=32).reasons["n_taps"]
-    short = suggest_settings(x[:400], PLANT, disturbance=d[:400])
-    assert "as long as this record supports" in short.reasons["n_taps"]
-    assert short.n_taps == (400 - S.size + 2) // 11
-    assert "as given" in suggest_settings(x, PLANT, disturbance=d, n_taps=64).reasons["n_taps"]
-    assert "gains less than 0.1 dB" in suggest_settings(X, PLANT, disturbance=D).reasons["n_taps"]
-
-
-def test_a_noise_that_cannot_be_controlled_is_called_so():
-    other = np.random.default_rng(9).standard_normal(X.size)
-    suggested = suggest_settings(X, PLANT, disturbance=other)
-    assert suggested.n_taps == settings.MULTIPLE
-    assert "the causality margin and the coherence tell the cause" in suggested.reasons["n_taps"]
-    assert "by 0.0 dB" in suggested.reasons["n_taps"]
-    assert "causality margin" not in suggest_settings(X, PLANT, disturbance=D).reasons["n_taps"]
-
-
-def test_the_noise_in_bursts_is_called_so():
-    x = bursty_noise(2.0, fs=FS, rng=0)
-    d = np.convolve(x, np.eye(30)[25])[: x.size] + 0.01 * np.random.default_rng(0).standard_normal(x.size)
-    assert "because the noise comes in bursts" in suggest_settings(x, PLANT, disturbance=d).reasons["state_noise"]
-    assert "bursts" not in suggest_settings(X, PLANT, disturbance=D).reasons["state_noise"]
+def test_it_says_why():
+    """What limits the length; and of noise that cannot be controlled, and of bursts, that they are that."""
+    (x, d), other = long_tail(), np.random.default_rng(9).standard_normal(X.size)
+    bursts = bursty_noise(2.0, fs=FS, rng=0)
+    late = np.convolve(bursts, np.eye(30)[25])[: bursts.size] + 0.01 * other
+    plain = {"gains less than 0.1 dB": "n_taps"}
+    cases = [
+        ((x, d), {"max_taps": 32}, {"as long as max_taps allows": "n_taps"}),
+        ((x[:400], d[:400]), {}, {"as long as this record supports": "n_taps"}),
+        ((x, d), {"n_taps": 64}, {"as given": "n_taps"}),
+        ((X, other), {}, {"causality margin and the coherence tell the cause": "n_taps", "by 0.0 dB": "n_taps"}),
+        ((bursts, late), {}, {"because the noise comes in bursts": "state_noise"}),
+        ((X, D), {}, plain),
+    ]
+    for (reference, disturbance), options, words in cases:
+        found = suggest_settings(reference, PLANT, disturbance=disturbance, **options)
+        assert all(said in found.reasons[name] for said, name in words.items()), found.reasons
+        if words is plain:
+            assert not any(said in reason for said in ("bursts", "causality") for reason in found.reasons.values())
+    assert suggest_settings(x[:400], PLANT, disturbance=d[:400]).n_taps == (400 - S.size + 2) // 11
+    assert suggest_settings(X, PLANT, disturbance=other).n_taps == settings.MULTIPLE
 
 
 # ---- What it refuses

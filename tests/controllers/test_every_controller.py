@@ -248,6 +248,13 @@ def test_bad_blocks_are_refused_before_anything_changes(name: str) -> None:
         with pytest.raises((ValueError, TypeError), match=message):
             controller.process(references, errors, **options)
         assert content_of(controller) == before, message
+    if hasattr(controller, "multichannel"):
+        for take in (controller.control_signal, controller.update, lambda v: controller.listen(x, np.outer(v, v))):
+            with pytest.raises(
+                (ValueError, TypeError), match=r"each of the|must be a single number|must be None|errors"
+            ):
+                take(np.ones(9))
+            assert content_of(controller) == before
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if name not in ("LimitedController", *PYTHONS)])

@@ -14,7 +14,6 @@ from scipy.signal import lfilter
 
 from kfopc_filterpy import Plant, SimulationResult, frequency_domain_fx_lms, noise_reduction_db, simulate
 from kfopc_filterpy.bounds import wiener_solution
-from kfopc_filterpy.controllers.frequency_domain import FrequencyDomainController
 
 FS, DELAY = 16000.0, 32
 SECONDARY = np.concatenate((np.zeros(DELAY), [0.8, 0.3, -0.2, 0.1]))
@@ -245,23 +244,3 @@ def test_the_error_stays_bounded(
 def test_settings_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         frequency_domain_fx_lms(**{"n_taps": 16, "secondary": SECONDARY, "block_size": 8, "step_size": 0.1} | options)
-
-
-@pytest.mark.parametrize(("where", "largest"), [("reference", 1e20), ("disturbance", 1e100)])
-def test_a_run_names_the_sample_that_is_refused(where: str, largest: float) -> None:
-    signals = dict(zip(("reference", "disturbance"), coloured(0.01), strict=True))
-    signals[where][77] = 2.0 * largest
-    with pytest.raises(ValueError, match=r"must not be louder than 1e\+\d+: .*\nin sample 77 of the run"):
-        simulate(near_wiener(), plant=Plant(SECONDARY, fs=FS), **signals)
-
-
-def test_a_run_records_what_a_subclass_tells_after_each_sample() -> None:
-    class Counting(FrequencyDomainController):
-        @property
-        def constraint_factor(self) -> float:
-            return float(self.samples_left)
-
-    rest = {"partition_size": None, "constrained": True, "forgetting": None, "n_references": 1}
-    controller = Counting(16, SECONDARY, step_size=0.1, block_size=4, **rest)
-    run = simulate(controller, np.ones(8), Plant(SECONDARY, PRIMARY, fs=FS))
-    np.testing.assert_array_equal(run.constraint_factor, [3, 2, 1, 4, 3, 2, 1, 4])

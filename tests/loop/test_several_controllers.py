@@ -22,7 +22,6 @@ from kfopc_filterpy import (
     kf_pb,
     simulate,
 )
-from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.loop import simulation
 from kfopc_filterpy.loop.inputs import STRETCH
 
@@ -112,19 +111,6 @@ def test_runs_that_share_gains_are_their_runs_one_by_one(shared, count, n, of_fi
         assert saturated == {2, 3} & set(range(count))
 
 
-def test_what_is_one_for_all(shared):
-    """One plant and one seed: each hears the same noise, and before the switch."""
-    x, _, _ = differing(1, 300)
-    plant = Plant(S, [0.0, 0.0, 1.2, -0.7], amplifier=HardClipAmplifier(0.7), fs=FS, sensor_noise_std=0.1)
-    made, alone = filters(9), filters(9)
-    results = simulate(made, x, plant, rng=5, switch_on_s=20 / FS)
-    expected = [simulate(c, x, plant, rng=5, switch_on_s=20 / FS) for c in alone]
-    assert_as_alone(results, expected, made, alone)
-    assert shared == [9]
-    noise = results[0].error - results[0].disturbance + results[0].anti_noise
-    np.testing.assert_allclose(noise, 0.1 * np.random.default_rng(5).standard_normal(300)[20:], rtol=0, atol=1e-14)
-
-
 KALMAN = {"state_noise": 1e-5, "measurement_noise": 0.1}
 APART = {  # what cannot share with a plain KF-ANC, each for a reason of its own
     "KF-PB learns the plant": lambda: kf_pb(7, S_HAT, rated_power=1.0, fs=FS),
@@ -163,12 +149,6 @@ def test_plants_that_do_not_allow_to_share(shared, plant):
     results = simulate(made, x, plant, disturbance=own["disturbance"][0])
     assert shared == []
     assert_as_alone(results, [simulate(c, x, plant, disturbance=own["disturbance"][0]) for c in alone], made, alone)
-
-
-def test_a_feedback_controllers_reference_is_its_own(shared):
-    made = [with_internal_model(kf_anc(7, S_HAT, **KALMAN)) for _ in range(2)]
-    simulate(made, None, Plant(S, fs=FS), disturbance=differing(1, 200)[2]["disturbance"][0])
-    assert shared == []
 
 
 def test_progress_counts_the_samples_of_all_runs():

@@ -135,13 +135,6 @@ def test_margins_of_several_channels_are_those_of_their_pairs():
     assert margin.margin_samples == margin.margin_s * FS
 
 
-def test_margins_of_whole_samples_and_the_pair_that_decides():
-    margin = causality_margin(arriving([[20], [25]], [[9, 30], [12, 5]]))
-    np.testing.assert_allclose(margin.margins_s * FS, [[11, -10], [13, 20]], atol=1e-9)
-    assert margin.margin_samples == pytest.approx(11)
-    assert margin.deciding_pair == (0, 0)
-
-
 def test_an_unplugged_loudspeaker_does_not_decide_the_margin():
     margin = causality_margin(arriving([[20], [22]], [[-1, 15], [-1, 30]]))
     np.testing.assert_allclose(margin.margins_s * FS, [[-np.inf, 5], [-np.inf, -8]], atol=1e-9)

@@ -224,6 +224,7 @@ SOUND = {
 def test_noise_that_changes_by_itself_is_no_alarm(name: str, noise: str) -> None:
     supervisor, e, d = controlled(SOUND[name](PATH), x=LOUD[noise](), amplitude_limit=1e3)
     assert not times(supervisor, LOUDER)
+    assert not supervisor.divergence_times_s
     assert db(e, d, 5.0, SECONDS) < -0.3
 
 
