@@ -224,7 +224,7 @@ def test_a_filter_refuses_and_stays_or_is_finite() -> None:
 
 
 WORDS = [
-    *("verdict", "paths", "identify", "inspect", "convert", "resample", "run"),
+    *("verdict", "paths", "identify", "inspect", "convert", "run"),
     *("noise.wav", "P.wav", "S.wav", "d.wav", "empty.wav", "text.wav", "zeros.wav"),
     *("nan.npy", "stereo.wav", "tiny.csv"),
     *("missing.wav", ".", "/dev/null", "", "é\u0000"[:1], "out.wav", "no/folder/out.wav", "out.xyz", "--", "-o"),
@@ -237,8 +237,8 @@ WORDS = [
 SCENE = ["noise.wav", "--primary", "P.wav", "--secondary", "S.wav", "--rated-power", "0.1"]
 COMMANDS = [
     ["paths", "inspect", "S.wav", "--primary", "P.wav", "--fs", "8000"],
-    ["paths", "convert", "S.wav", "S2.csv", "--channel", "0"],
-    ["paths", "resample", "S.wav", "S3.wav", "--fs", "4000"],
+    ["paths", "convert", "S.wav", "-o", "S2.csv", "--channel", "0"],
+    ["paths", "convert", "S.wav", "-o", "S3.wav", "--fs", "4000"],
     ["paths", "identify", "noise.wav", "d.wav", "--taps", "16", "-o", "S4.wav"],
     ["verdict", *SCENE, "--ohm", "8", "--want-db", "nan"],
     ["run", *SCENE, "--seconds", "nan"],

@@ -29,7 +29,7 @@ def report(title: str = "own") -> StudyReport:
 
 
 def convert(folder: Path, name: str) -> None:
-    if main(["paths", "convert", str(folder / "S.wav"), str(folder / name)]):
+    if main(["paths", "convert", str(folder / "S.wav"), "-o", str(folder / name)]):
         raise OSError
 
 

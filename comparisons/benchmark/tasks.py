@@ -21,9 +21,10 @@ from kfopc_filterpy import Plant, bandpass_path, power_constrained_wiener
 from kfopc_filterpy._validate import as_choice
 from kfopc_filterpy.controllers import Controller
 from kfopc_filterpy.paths import duct_plant
-from kfopc_filterpy.signals import band_limited_noise, compressor_noise, looped, tone
+from kfopc_filterpy.signals import band_limited_noise, compressor_noise, tone
 
 from ..bench import Scene, make_scene
+from ..bench.noises import looped
 from ..bench.scene import reachable_weights
 from ..studies.cases import measured_data, of_unit_gain
 from ..studies.multichannel_rooms import built_in_room

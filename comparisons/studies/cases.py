@@ -16,6 +16,7 @@ from kfopc_filterpy.paths import duct_plant
 
 from ..bench import Runs, Scene, Tuned, algorithms, make_controller, make_scene, run_settings
 from ..bench.measured import DataUnavailableError, MeasuredDuct, load_measured_duct, load_measured_room
+from ..bench.noises import bursty_noise, level_jump, looped, swelling
 from ..bench.scene import louder, reachable_weights
 from ..bench.tuning import best_setting, try_settings
 
@@ -122,13 +123,13 @@ def made_noises(band_hz: tuple[float, float] = WIDE_BAND_HZ) -> dict[str, Noise]
 
     def swelling_band_noise(duration: float, seed: int) -> np.ndarray:
         steady = band_noise(duration, seed)
-        return signals.swelling(steady, fs=FS, swing_db=SWING_DB, period_s=PERIOD_S, phase_rad=float(seed))
+        return swelling(steady, fs=FS, swing_db=SWING_DB, period_s=PERIOD_S, phase_rad=float(seed))
 
     return {
         "tone": lambda duration, seed: signals.tone(TONE_HZ, duration, fs=FS, phase_rad=float(seed)),
         "compressor": lambda duration, seed: signals.compressor_noise(duration, fs=FS, rng=seed),
         "band noise": band_noise,
-        "bursts": lambda duration, seed: signals.bursty_noise(duration, fs=FS, rng=seed),
+        "bursts": lambda duration, seed: bursty_noise(duration, fs=FS, rng=seed),
         "swelling band noise": swelling_band_noise,
     }
 
@@ -138,7 +139,7 @@ def noises() -> dict[str, Noise]:
     made = made_noises()
     found = recordings("motor")
     if found:
-        made["motor"] = lambda duration, seed: signals.looped(found["motor"], duration, fs=FS, start_s=2.5 * seed)
+        made["motor"] = lambda duration, seed: looped(found["motor"], duration, fs=FS, start_s=2.5 * seed)
     return made
 
 
@@ -206,8 +207,8 @@ def driven_case(plant: Plant, noise: np.ndarray, overdrive_db: float) -> Scene:
 def jumping(scene: Scene, plant: Plant, span_s: tuple[float, float], gain_db: float) -> Scene:
     """Return a scene of one seed whose noise is louder between two times of the record."""
     begin_s, end_s = span_s
-    louder = signals.level_jump(scene.references[0], begin_s, gain_db, fs=FS)
-    return heard_on(scene, plant, signals.level_jump(louder, end_s, -gain_db, fs=FS))
+    louder = level_jump(scene.references[0], begin_s, gain_db, fs=FS)
+    return heard_on(scene, plant, level_jump(louder, end_s, -gain_db, fs=FS))
 
 
 def heard_on(scene: Scene, plant: Plant, x: np.ndarray) -> Scene:

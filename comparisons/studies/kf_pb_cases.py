@@ -12,8 +12,8 @@ from scipy.signal import fftconvolve
 
 from kfopc_filterpy import Plant, kf_pb, noise_reduction_db, power_constrained_wiener, simulate
 from kfopc_filterpy.paths import path_taps, perturbed_path
-from kfopc_filterpy.signals import level_jump, looped
 
+from ..bench.noises import level_jump, looped
 from ..bench.scene import reachable_weights
 from .cases import FS, SENSOR_NOISE_DB, made_noises, measured_room, plants, recordings
 

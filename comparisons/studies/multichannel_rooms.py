@@ -14,6 +14,7 @@ from scipy.signal import fftconvolve
 from kfopc_filterpy import Plant, SimulationResult, signals
 
 from ..bench import FigureItem, Scene
+from ..bench.noises import looped
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of, measured_room, recordings, unit_scene
 from .report_parts import new_figure
 
@@ -122,7 +123,7 @@ def _measured_place() -> Place | None:
     noises = _noises(room.fs, WIDE_BAND_HZ)
     del noises["compressor"]  # the recorded one takes its place
     for name, recording in zip(RECORDINGS, found.values(), strict=True):
-        noises[name] = partial(signals.looped, recording, fs=room.fs)
+        noises[name] = partial(looped, recording, fs=room.fs)
     return Place(MEASURED, MEASURED_N_TAPS, room, noises)
 
 

@@ -309,7 +309,7 @@ def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndar
 
 def calibration_of(options: argparse.Namespace, files: Files, n_microphones: int) -> ArrayLike | None:
     """Return the pascals per unit of the error microphones, of all or of each; None if the options give none."""
-    from ..signals import calibration_factor
+    from ..signals.recordings import calibration_factor
 
     pascals, option = options.pascal_per_unit, "--pascal-per-unit"
     if options.calibrator is not None:

@@ -1,4 +1,4 @@
-"""`kfopc paths`: identify, inspect, convert, resample and plot impulse responses."""
+"""`kfopc paths`: identify, inspect and convert impulse responses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ POOR_DB = -20.0  # a warning is printed if more of the response is left unexplai
 
 def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     """Add the subcommand, which has actions of its own."""
-    about = "identify, inspect, convert, resample and plot impulse responses"
+    about = "identify, inspect and convert impulse responses"
     parser = commands.add_parser("paths", help=about, description=sentence(about))
     actions = parser.add_subparsers(required=True, metavar="ACTION")
 
@@ -44,22 +44,11 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     own.add_argument("--primary", metavar="FILE", help=about)
     own.add_argument("--json", action="store_true", help="print JSON")
     add_reading(own)
-    own = add("convert", convert, "write an impulse response in another format", "S.wav S.csv")
+    about = "write an impulse response in another format, or at another sample rate"
+    own = add("convert", convert, about, "S.wav -o S16.csv --fs 16000")
+    own.add_argument("path", help="the impulse response; - is standard input")
+    own.add_argument("-o", "--output", metavar="FILE", required=True, help=f"file to write: {', '.join(WRITTEN)}")
     add_reading(own)
-    _add_written(own)
-    own = add("resample", convert, "write an impulse response at another sample rate", "S.wav S16.wav --fs 16000")
-    add_reading(own, "the new rate", required=True)
-    _add_written(own)
-    own = add("plot", plot, "draw impulse responses and frequency responses", "P.wav S.wav -o paths.png")
-    own.add_argument("path", nargs="+", help="impulse responses of one sample rate")
-    own.add_argument("-o", "--output", metavar="FILE", required=True, help="figure to write: .png, .svg or .pdf")
-    add_reading(own)
-
-
-def _add_written(parser: Any) -> None:
-    parser.add_argument("path", help="the impulse response; - is standard input")
-    parser.add_argument("to", nargs="?", metavar="output", help=f"file to write: {', '.join(WRITTEN)}")
-    parser.add_argument("-o", "--output", metavar="FILE", help="the same file, as an option")
 
 
 def identify(options: argparse.Namespace) -> int:
@@ -177,14 +166,11 @@ def _described(facts: dict[str, Any]) -> str:
 
 def convert(options: argparse.Namespace) -> int:
     """Write an impulse response in another format or at another rate."""
-    if (options.to is None) == (options.output is None):
-        raise ValueError("one file to write is needed, for example S.csv, or -o S.csv")
-    output = options.to if options.to is not None else options.output
-    _require_output(output)
+    _require_output(options.output)
     files = Files(options)
     taps = files.path(options.path)
-    _write_path(output, taps, files.fs)
-    print(f"{output}: {taps.size} taps at {files.fs:g} Hz")
+    _write_path(options.output, taps, files.fs)
+    print(f"{options.output}: {taps.size} taps at {files.fs:g} Hz")
     return DONE
 
 
@@ -215,27 +201,3 @@ def _write_path(output: str, taps: np.ndarray, fs: float) -> None:
         else:
             timed = np.column_stack([np.arange(taps.size) / fs, taps])
             np.savetxt(file, timed, delimiter="," if suffix == ".csv" else "\t", fmt="%.17g")
-
-
-def plot(options: argparse.Namespace) -> int:
-    """Write a figure of impulse responses."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from ..plot import plot_bode, plot_impulse_responses
-
-    files = Files(options)
-    stems = [Path(name).stem for name in options.path]
-    labels = [stem if stems.count(stem) == 1 else name for stem, name in zip(stems, options.path, strict=True)]
-    taps = {label: files.path(name) for label, name in zip(labels, options.path, strict=True)}
-    figure, axes = plt.subplots(3, 1, figsize=(7, 8), layout="constrained")
-    plot_impulse_responses(taps, fs=files.fs, ax=axes[0])
-    plot_bode(taps, fs=files.fs, ax=axes[1:])
-    output = Path(options.output)
-    output = output if output.suffix else output.with_suffix(".png")
-    with replacing(output) as file:
-        figure.savefig(file, format=output.suffix[1:], dpi=160)
-    print(f"{output} written")
-    return DONE

@@ -8,7 +8,6 @@ from .running import IdentifiedPlant as IdentifiedPlant
 from .running import NotCausalError as NotCausalError
 from .running import RunReport as RunReport
 from .running import RunStatus as RunStatus
-from .running import measure_round_trip as measure_round_trip
 from .running import run as run
 from .sound_device import SoundDevice as SoundDevice
 from .supervisor import Supervisor as Supervisor

@@ -270,60 +270,7 @@ def _finite(signals: np.ndarray) -> np.ndarray:
     return np.where(np.abs(signals) <= LARGEST, signals, 0.0)
 
 
-def measure_round_trip(
-    interface: Interface, *, level: float, seconds: float = 1.0, longest: int = 4096, rng: Seed = 0
-) -> int:
-    """Return the number of samples from a control signal to its first arrival at an error microphone.
-
-    White noise is played, from each loudspeaker in turn, and each microphone's signal correlated with it.
-
-    Parameters
-    ----------
-    interface : Interface
-        Interface, not yet started.
-    level : float
-        Standard deviation of the noise, above zero.
-    seconds : float, default 1
-        Time for each loudspeaker.
-    longest : int, default 4096
-        Longest round trip looked for, in samples.
-    rng : int or numpy.random.Generator, default 0
-        Seed of the noise.
-
-    Returns
-    -------
-    int
-        Round trip, which includes the buffers of the interface.
-
-    Raises
-    ------
-    FaultError
-        No loudspeaker is heard: the correlation has no clear peak. Or samples were lost, or the output ran dry.
-    TypeError, ValueError
-        A level or time that is not positive.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kfopc_filterpy import Plant
-    >>> from kfopc_filterpy.realtime import SimulatedInterface, measure_round_trip
-    >>> interface = SimulatedInterface(np.zeros(20000), Plant([0.0, 0.0, 0.8], [0.0], fs=16000), block=32)
-    >>> measure_round_trip(interface, level=0.1)  # two blocks of 32 samples, and two samples of the path
-    66
-    """
-    level, longest = as_positive(level, "level"), as_count(longest, "longest")
-    n = round(as_positive(seconds, "seconds", unit="s") * interface.fs) + longest
-    if n < 2 * longest:
-        raise ValueError(f"seconds must be at least longest / fs, {longest / interface.fs:.3g} s, got {seconds:g} s")
-    noises = np.tile(level * as_generator(rng).standard_normal(n), (interface.n_loudspeakers, 1))
-    with _open(interface):
-        session = _Session(interface)
-        with session.without_gaps("the round trip was measured"):
-            recordings = _recorded(session, noises)
-    return _round_trip(recordings, longest, "the level")
-
-
-def _recorded(session: _Session, noises: np.ndarray, rest: int = 0) -> list[_Heard]:
+def _recorded(session: _Session, noises: np.ndarray, rest: int) -> list[_Heard]:
     """Play noises (J, n), one from each loudspeaker in turn, and return what was heard meanwhile.
 
     After each, `rest` samples of silence let it die away.
@@ -333,17 +280,18 @@ def _recorded(session: _Session, noises: np.ndarray, rest: int = 0) -> list[_Hea
         signal = np.zeros_like(noises)
         signal[j] = noise
         recordings.append(session.play(signal))
-        if rest:
-            session.play(np.zeros((len(noises), rest)))
+        session.play(np.zeros((len(noises), rest)))
     return recordings
 
 
-def _round_trip(recordings: list[_Heard], longest: int, what: str) -> int:
-    """Return the first lag at which a loudspeaker is heard; `what` to raise if none is."""
+def _round_trip(recordings: list[_Heard], longest: int) -> int:
+    """Return the first lag at which a loudspeaker is heard."""
     arrivals = [_arrival(own.y[j], e, longest) for j, own in enumerate(recordings) for e in own.e]
     clear = [arrival for arrival in arrivals if arrival is not None]
     if not clear:
-        raise FaultError(f"no loudspeaker is heard by any error microphone: check cables and channels, or raise {what}")
+        raise FaultError(
+            "no loudspeaker is heard by any error microphone: check cables and channels, or raise excitation"
+        )
     return min(clear)
 
 
@@ -651,7 +599,7 @@ def _identified(
     with session.without_gaps("the path was identified"):
         limited = np.clip(noises, -limits[:, np.newaxis], limits[:, np.newaxis])
         recordings = _recorded(session, limited, rest=round(0.1 * fs))
-    round_trip = _round_trip(recordings, n // 4, "excitation")
+    round_trip = _round_trip(recordings, n // 4)
     taps = round_trip + round(0.016 * fs) if n_path is None else as_count(n_path, "n_path")
     if taps <= round_trip:
         raise ValueError(f"n_path must exceed the round trip, {round_trip} samples, got {n_path}")

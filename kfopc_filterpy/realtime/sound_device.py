@@ -33,7 +33,7 @@ class SoundDevice:
         Device, or input and output device, as sounddevice names them (``python -m sounddevice`` lists them); by default
         the system's.
     latency : float or {"low", "high"}, default "low"
-        What sounddevice is asked for. `measure_round_trip` measures what came of it.
+        What sounddevice is asked for. A run's `round_trip_samples` are what came of it.
     ahead : int, default 2
         Blocks of silence that are played first. The control signal is late by so many blocks, besides the delay of the
         device.

@@ -1,14 +1,8 @@
-from .generators import Bursts as Bursts
 from .generators import Compressor as Compressor
 from .generators import band_limited_noise as band_limited_noise
-from .generators import bursty_noise as bursty_noise
 from .generators import compressor_noise as compressor_noise
 from .generators import tone as tone
 from .recordings import Recording as Recording
-from .recordings import calibration_factor as calibration_factor
 from .recordings import read_recording as read_recording
 from .recordings import write_wav as write_wav
-from .shaping import level_jump as level_jump
-from .shaping import looped as looped
 from .shaping import scaled_to_power as scaled_to_power
-from .shaping import swelling as swelling

@@ -1,4 +1,4 @@
-"""Seeded primary noises: tone, band-limited noise, compressor-like machine noise, bursts.
+"""Seeded primary noises: tone, band-limited noise, compressor-like machine noise.
 
 Every generator returns one channel, a float64 array (n_samples,) with n_samples = round(duration_s * fs) >= 1, and
 draws its randomness only from `rng` (a seed or a numpy.random.Generator), so that the same call gives the same samples.
@@ -235,106 +235,6 @@ def compressor_noise(
     if share > 0:
         signal = signal + scaled_to_power(_broadband(machine.bandwidth_hz, n_samples, fs, generator), share)
     return scaled_to_power(signal, power)
-
-
-@dataclass(frozen=True)
-class Bursts:
-    """Bursts and background that `bursty_noise` makes.
-
-    Attributes
-    ----------
-    rate_hz : float, default 10.0
-        Mean number of bursts per second; they come as a Poisson process.
-    decay_s : float, default 0.012
-        Time constant of a burst's amplitude in seconds.
-    band : (float, float), default (100.0, 1500.0)
-        Band in Hz of bursts and background (Butterworth, four poles at either edge).
-    level_spread_db : float, default 4.0
-        Standard deviation of the bursts' levels in dB.
-    background_db : float, default -20.0
-        Power of the background over that of the bursts in dB.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If a value is not a number in its range.
-
-    Examples
-    --------
-    >>> Bursts(rate_hz=2.0).band
-    (100.0, 1500.0)
-    """
-
-    rate_hz: float = 10.0
-    decay_s: float = 0.012
-    band: tuple[float, float] = (100.0, 1500.0)
-    level_spread_db: float = 4.0
-    background_db: float = -20.0
-
-    def __post_init__(self) -> None:
-        as_positive(self.rate_hz, "rate_hz", unit="Hz")
-        as_positive(self.decay_s, "decay_s", unit="s")
-        as_nonnegative(self.level_spread_db, "level_spread_db", unit="dB")
-        as_number(self.background_db, "background_db", unit="dB")
-
-
-def bursty_noise(
-    duration_s: float, bursts: Bursts | None = None, *, fs: float, rng: Seed, power: float = 1.0
-) -> np.ndarray:
-    """Make impulsive noise, as of presses or rivets: bursts at random times that die away, over a steady background.
-
-    Parameters
-    ----------
-    duration_s : float
-        Duration in seconds.
-    bursts : Bursts, optional
-        Rate, decay, band and levels, by default those of ``Bursts()``.
-    fs : float
-        Sampling frequency in Hz.
-    rng : int or numpy.random.Generator
-        Seed or generator.
-    power : float, default 1.0
-        Mean square of the signal, met exactly.
-
-    Returns
-    -------
-    ndarray, shape (n_samples,)
-        The noise.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If an argument is not in its range, no burst falls into the duration, or `rng` is None.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> x = bursty_noise(2.0, fs=16000, rng=1)
-    >>> round(float(np.mean(x**2)), 12), bool(np.max(np.abs(x)) > 6.0)  # Gaussian noise stays below 5
-    (1.0, True)
-    """
-    from scipy.signal import butter, oaconvolve, sosfilt
-
-    n_samples = as_sample_count(duration_s, fs, "duration_s")
-    bursts = Bursts() if bursts is None else bursts
-    low, high = as_band(bursts.band, fs)
-    generator = as_generator(rng)
-    count = generator.poisson(bursts.rate_hz * n_samples / fs)
-    if count == 0:
-        raise ValueError(
-            f"no burst fell into duration_s = {duration_s:g} s: take a longer duration or a higher rate_hz"
-        )
-    decay = bursts.decay_s * fs
-    levels = np.zeros(n_samples)
-    times = generator.integers(0, n_samples, count)
-    levels_db = bursts.level_spread_db * generator.standard_normal(count)
-    np.add.at(levels, times, 10 ** (levels_db / 20))
-    envelope = oaconvolve(levels, np.exp(-np.arange(max(round(6 * decay), 1)) / decay))[:n_samples]
-    sos = butter(4, (max(low, 1e-6 * fs), min(high, 0.499999 * fs)), "bandpass", fs=fs, output="sos")
-    impulsive = sosfilt(sos, np.maximum(envelope, 0.0) * generator.standard_normal(n_samples))
-    steady = sosfilt(sos, generator.standard_normal(n_samples))
-    background = 10 ** (bursts.background_db / 20)
-    return scaled_to_power(scaled_to_power(impulsive, 1.0) + scaled_to_power(steady, 1.0) * background, power)
 
 
 def _shaped_noise(gains: np.ndarray, n_samples: int, generator: np.random.Generator) -> np.ndarray:

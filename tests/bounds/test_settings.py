@@ -7,9 +7,10 @@ import pytest
 from helpers.channels import dense_systems
 from helpers.settings_grid import FS, NOISES, ON, compare, made_plants, noisy_scene, silent_run
 
+from comparisons.bench.noises import bursty_noise
 from kfopc_filterpy import Plant, kf_anc, simulate, suggest_settings
 from kfopc_filterpy.bounds import measurement_noise_from_run, settings
-from kfopc_filterpy.signals import bursty_noise, tone
+from kfopc_filterpy.signals import tone
 
 S = np.array([0.0, 0.0, 0.8, 0.3])
 PLANT = Plant(S, fs=FS)

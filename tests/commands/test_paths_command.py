@@ -64,7 +64,7 @@ def test_a_recording_given_as_a_path_is_analysed_with_a_warning(command, folder)
 @pytest.mark.parametrize("suffix", ["wav", "npy", "csv", "txt"])
 def test_a_path_is_converted_without_loss(command, tmp_path, suffix):
     output = tmp_path / f"S.{suffix}"
-    code, _, _ = command("paths", "convert", "S.wav", output)
+    code, _, _ = command("paths", "convert", "S.wav", "-o", output)
     assert code == 0
     if suffix == "wav":
         taps = soundfile.read(output)[0]
@@ -77,7 +77,7 @@ def test_a_path_is_converted_without_loss(command, tmp_path, suffix):
 
 
 def test_a_path_is_resampled_with_its_gain(command, tmp_path):
-    code, _, _ = command("paths", "resample", "S.wav", tmp_path / "S.wav", "--fs", 2 * FS)
+    code, _, _ = command("paths", "convert", "S.wav", "-o", tmp_path / "S.wav", "--fs", 2 * FS)
     assert code == 0
     taps, fs = soundfile.read(tmp_path / "S.wav")
     assert fs == 2 * FS
@@ -85,7 +85,7 @@ def test_a_path_is_resampled_with_its_gain(command, tmp_path):
     assert int(np.argmax(np.abs(taps))) == 24
 
 
-def test_a_path_is_inspected_and_plotted(command, tmp_path):
+def test_a_path_is_inspected(command):
     code, out, _ = command("paths", "inspect", "S.wav", "--primary", "P.wav", "--json")
     assert code == 0
     facts = json.loads(out)
@@ -95,22 +95,6 @@ def test_a_path_is_inspected_and_plotted(command, tmp_path):
     code, out, _ = command("paths", "inspect", "P.wav", "--primary", "S.wav")
     assert code == 0
     assert "too late" in out
-    code, _, _ = command("paths", "plot", "P.wav", "S.wav", "-o", tmp_path / "paths.png")
-    assert code == 0
-    assert (tmp_path / "paths.png").read_bytes().startswith(b"\x89PNG")
-    code, out, _ = command("paths", "plot", "P.wav", "S.wav", "-o", tmp_path / "plots")
-    assert out == f"{tmp_path / 'plots.png'} written\n"
-    assert (tmp_path / "plots.png").is_file()
-
-
-def test_paths_of_one_name_in_two_folders_are_both_drawn(command, tmp_path):
-    for folder, at in (("a", 12), ("b", 15)):
-        (tmp_path / folder).mkdir()
-        write_wav(tmp_path / folder / "S.wav", np.eye(64)[at], FS)
-    paths = [tmp_path / folder / "S.wav" for folder in ("a", "b")]
-    assert command("paths", "plot", *paths, "P.wav", "-o", tmp_path / "paths.svg")[0] == 0
-    drawn = (tmp_path / "paths.svg").read_text()
-    assert all(f"<!-- {label} -->" in drawn for label in (*paths, "P"))
 
 
 @pytest.mark.parametrize("output", ["no/S.wav", "S.mp3"])

@@ -14,18 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from comparisons.bench.noises import bursty_noise, looped, swelling
 from kfopc_filterpy import Plant, bandpass_path, kf_anc, kf_opc, simulate, suggest_settings
 from kfopc_filterpy.bounds import SuggestedSettings, wiener_solution
 from kfopc_filterpy.paths import duct_plant
-from kfopc_filterpy.signals import (
-    band_limited_noise,
-    bursty_noise,
-    compressor_noise,
-    looped,
-    scaled_to_power,
-    swelling,
-    tone,
-)
+from kfopc_filterpy.signals import band_limited_noise, compressor_noise, scaled_to_power, tone
 
 FS = 16000.0
 ON = 8000  # samples until the control is switched on: the start-up of the primary path is over

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.io import loadmat
 from scipy.signal import resample_poly
 
+from comparisons.bench import noises
 from kfopc_filterpy import OutputLimiter, OutputPowerConstraint, Plant, fx_lms, fx_nlms, kf_opc, kf_pb, signals
 from kfopc_filterpy.commands.run import summarize
 from kfopc_filterpy.controllers import VirtualMicrophones, with_internal_model
@@ -205,10 +206,10 @@ def test_a_path_that_became_longer_is_in_the_report_of_a_run() -> None:
 
 LOUD: dict[str, Any] = {
     "steady": lambda: NOISE,
-    "swelling": lambda: signals.swelling(NOISE, fs=FS, swing_db=10.0, period_s=3.0),
-    "a jump up": lambda: signals.level_jump(NOISE, 3.0, 20.0, fs=FS),
-    "a jump down": lambda: signals.level_jump(NOISE, 3.0, -20.0, fs=FS),
-    "bursts": lambda: signals.bursty_noise(SECONDS, fs=FS, rng=2),
+    "swelling": lambda: noises.swelling(NOISE, fs=FS, swing_db=10.0, period_s=3.0),
+    "a jump up": lambda: noises.level_jump(NOISE, 3.0, 20.0, fs=FS),
+    "a jump down": lambda: noises.level_jump(NOISE, 3.0, -20.0, fs=FS),
+    "bursts": lambda: noises.bursty_noise(SECONDS, fs=FS, rng=2),
     "compressor": lambda: signals.compressor_noise(SECONDS, fs=FS, rng=3),
 }
 SOUND = {

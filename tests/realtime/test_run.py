@@ -24,7 +24,6 @@ from kfopc_filterpy.realtime import (
     SimulatedInterface,
     SoundDevice,
     interfaces,
-    measure_round_trip,
     run,
 )
 
@@ -183,38 +182,12 @@ def test_a_loudspeaker_that_is_not_heard_is_a_fault() -> None:
         started(SimulatedInterface(X, Plant([0.0, 0.0], PRIMARY, fs=FS), block=32, latency=64))
     with pytest.raises(FaultError, match="ended before anything was heard"):
         started(SimulatedInterface(X[:4000], Plant(S, PRIMARY, fs=FS), block=32, latency=64))
-    with pytest.raises(FaultError, match="no loudspeaker is heard"):
-        measure_round_trip(SimulatedInterface(X, Plant([0.0, 0.0], fs=FS), disturbance=X), level=0.1, longest=256)
 
 
 @pytest.mark.parametrize("delay", [64, 333])
 def test_the_round_trip_is_measured_under_noise(delay: int) -> None:
-    interface = SimulatedInterface(X, Plant([0.0, 0.9, 0.2], fs=FS), disturbance=0.3 * X[::-1], block=64, latency=delay)
-    assert measure_round_trip(interface, level=0.3, longest=1000) == delay + 1
-
-
-def test_the_round_trip_is_measured_with_one_loudspeaker_after_the_other_at_the_level_asked_for() -> None:
-    paths = np.zeros((1, 2, 30))
-    paths[0, 0, 20], paths[0, 1, 5] = 1.0, 1.0  # the second one is nearer
-    interface = Recorded(np.zeros(16000), Plant(paths, fs=FS), disturbance=np.zeros((1, 16000)), block=32, latency=64)
-    assert measure_round_trip(interface, level=0.3, seconds=0.5, longest=256) == 64 + 5
-    played = np.concatenate(interface.played, axis=1)
-    n = -(-(4000 + 256) // 32) * 32
-    np.testing.assert_allclose(np.std(played[0, :4256]), 0.3, rtol=0.04)  # 4256 samples: 3.5 standard errors
-    np.testing.assert_array_equal(played[1, n:], played[0, :n])
-    assert not np.any(played[0, n:])
-    assert not np.any(played[1, :n])
-
-
-def test_a_round_trip_needs_as_much_time_as_the_longest_one() -> None:
-    def measured(seconds: float) -> int:
-        silent = np.zeros(16000)
-        interface = SimulatedInterface(silent, Plant(S, fs=FS), disturbance=silent, block=32, latency=64)
-        return measure_round_trip(interface, level=0.1, seconds=seconds, longest=1000)
-
-    assert measured(1000 / FS) == 65
-    with pytest.raises(ValueError, match=r"seconds must be at least longest / fs, 0\.125 s, got 0\.124875 s"):
-        measured(999 / FS)
+    interface = SimulatedInterface(X, Plant(S, PRIMARY, fs=FS), block=64, latency=delay)
+    assert started(interface, seconds=0.1, check_causality=False).round_trip_samples == delay + 1
 
 
 @pytest.mark.parametrize(("samples", "blocks"), [(319, 11), (320, 11), (321, 12)])
@@ -420,25 +393,12 @@ def test_lost_and_repeated_blocks_of_a_card_are_in_the_health_record(plugged: Ca
 
 
 @pytest.mark.parametrize(("what", "message"), [("lost_at", "32 samples were lost"), ("dry_at", "the output ran dry")])
-def test_nothing_is_measured_across_a_gap(what: str, message: str, plugged: Callable[..., Card]) -> None:
+def test_no_path_is_identified_across_a_gap(what: str, message: str, plugged: Callable[..., Card]) -> None:
     card = plugged()
     setattr(card, what, [200])
     with pytest.raises(FaultError, match=f"{message}.* while the path was identified"):
         started(PluggedDevice(card), amplitude_limit=0.8)
     assert card.states == ["start", "stop", "close"]
-
-    def round_trip(gaps: list[int]) -> int:
-        card = plugged(disturbance=np.zeros_like(X))
-        card.lost_at, card.dry_at = [], []
-        setattr(card, what, gaps)
-        try:
-            return measure_round_trip(PluggedDevice(card), level=0.1, longest=256)
-        finally:
-            assert card.states == ["start", "stop", "close"]
-
-    assert round_trip([]) == 65
-    with pytest.raises(FaultError, match=f"{message}.* while the round trip was measured, so it .* run again"):
-        round_trip([200])
 
 
 def test_a_block_that_comes_too_late_is_left_out_and_the_next_is_in_time(plugged: Callable[..., Card]) -> None:
