@@ -174,7 +174,7 @@ def bare(session: nox.Session) -> None:
 def wheels(session: nox.Session) -> None:
     """Make the wheels of all systems in dist/, with zig's compiler."""
     session.install("hatchling>=1.25", "ziglang>=0.13")
-    zig = f"'{shutil.which('python', path=session.bin)}' -m ziglang cc"
+    zig = f"'{shutil.which('python', path=session.bin)}' -P -m ziglang cc"
     own = {"CC": zig, "CFLAGS": None, "CPPFLAGS": None, "LDFLAGS": None}
     dist = Path("dist")
     shutil.rmtree(dist, ignore_errors=True)

@@ -64,6 +64,18 @@ def test_import_leaves_heavy_modules_for_later_and_warns_of_nothing(statement):
     assert run.stdout.split() == [], f"{statement} loads {run.stdout.strip()}"
 
 
+def test_every_python_that_is_started_ignores_the_current_folder():
+    """A json.py beside a user's recordings is not ours to run."""
+    started = [
+        (path.name, option)
+        for folder in ("kfopc_filterpy", "comparisons", "docs/extensions")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        for option in re.findall(r"sys\.executable,\s*([^,]*)", path.read_text(encoding="utf-8"))
+    ]
+    assert len(started) >= 3
+    assert [one for one in started if one[1] != '"-P"'] == []
+
+
 PARTS = [
     "filters",
     "power",

@@ -38,7 +38,17 @@ def webassembly() -> bytes:
     target = ["-target", "wasm32-wasi", "-mexec-model=reactor", "-msimd128", "-DANC_FLOAT", f"-I{FOLDER}"]
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "player.wasm"
-        command = [sys.executable, "-m", "ziglang", "cc", *flags, *target, "-Wl,--strip-all", *map(str, sources())]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "ziglang",
+            "cc",
+            *flags,
+            *target,
+            "-Wl,--strip-all",
+            *map(str, sources()),
+        ]
         done = subprocess.run([*command, "-o", str(output)], capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"the core was not compiled to WebAssembly (is ziglang installed?): {done.stderr}")

@@ -37,6 +37,7 @@ _REFUSED = (
     *("-ffp-model=fast", "-ffp-model=aggressive", "-mfpmath=387", "-mfpmath=both", "-mfpmath=sse+387", "-mdaz-ftz"),
 )
 _REFUSED_BEGINNINGS = ("-mrecip", "-fdenormal-fp-math", "-Wp,-ffast-math")
+_KEPT_OF_MACHINE = ("-m32", "-m64", "-mx32", "-mmacosx-version-min")
 
 
 class BuildError(RuntimeError):
@@ -57,7 +58,7 @@ def compiler(target: str = "") -> list[str]:
     if own and (not target or _is_zig(own)):
         return own
     if importlib.util.find_spec("ziglang"):
-        return [sys.executable, "-m", "ziglang", "cc"]
+        return [sys.executable, "-P", "-m", "ziglang", "cc"]
     if target:
         raise BuildError(f"only zig builds for other machines, such as {target}: {_pip()} install ziglang")
     raise BuildError(
@@ -93,6 +94,8 @@ def library_name(real: str, level: str, target: str = "") -> str:
 def flags(command: list[str], real: str = "double", level: str = LEVELS[0], target: str = "") -> list[str]:
     """Return the compiler's flags: those of CFLAGS, CPPFLAGS and LDFLAGS, then ours, which decide.
 
+    On a processor with levels, flags of the environment that choose instructions, such as ``-mavx2``, are left out.
+
     Raises
     ------
     BuildError
@@ -102,6 +105,8 @@ def flags(command: list[str], real: str = "double", level: str = LEVELS[0], targ
     for flag in (*command, *given):
         if flag in _REFUSED or flag.startswith(_REFUSED_BEGINNINGS):
             raise BuildError(f"kfopc_filterpy promises equal bits on every machine: {flag} breaks this, remove it")
+    if len(levels(target)) > 1:  # the level chooses the instructions: a -mavx2 would outlive the -march after it
+        given = [flag for flag in given if not flag.startswith("-m") or flag.startswith(_KEPT_OF_MACHINE)]
     public = '__attribute__((visibility("default")))'
     if _system(target) == "windows":
         public = "__declspec(dllexport)"

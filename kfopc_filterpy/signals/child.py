@@ -43,7 +43,7 @@ def read_in_child(
         "limit_s": limit_s,
         "search": sys.path,
     }
-    command = [sys.executable, "-c", _RUN, json.dumps(job)]
+    command = [sys.executable, "-P", "-c", _RUN, json.dumps(job)]
     # glibc would reserve 64 MB for the thread of the time limit, at times after the memory limit is set.
     environment = os.environ | {"MALLOC_ARENA_MAX": "1"}
     with subprocess.Popen(

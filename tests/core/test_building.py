@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import os
+import platform
 import re
 import shutil
 import subprocess
@@ -159,6 +161,46 @@ def test_flags_of_packagers_are_honoured(tmp_path: Path, no_flags: pytest.Monkey
     assert building.stamp_of(ctypes.CDLL(str(made))) == building.stamp()
 
 
+@pytest.mark.skipif(len(building.levels()) == 1, reason="this processor has one level")
+def test_instructions_of_the_environment_reach_no_library(no_flags: pytest.MonkeyPatch) -> None:
+    """The baseline runs everywhere: what the compiler takes for the processor is the level's, for any CFLAGS."""
+    command = c_compiler()
+
+    def instructions() -> str:
+        given = [flag for flag in building.flags(command) if not flag.startswith("-Wl")]
+        listing = ran(*command, *given, "-m64", "-dM", "-E", "-x", "c", "/dev/null")
+        return "\n".join(line for line in listing.splitlines() if re.search("SSE|AVX|FMA|BMI|LZCNT|POPCNT", line))
+
+    own = instructions()
+    no_flags.setenv("CFLAGS", "-O2 -m64 -mavx2 -mfma -msse4.2 -march=native -mpopcnt -mtune=native")
+    assert instructions() == own
+    assert "AVX" not in own
+
+
+@pytest.mark.parametrize("processor", ["x86-64", "x86-64-v4", "sapphirerapids"])
+def test_headers_take_the_flags_of_strangers(processor: str, tmp_path: Path) -> None:
+    """Without -std, a processor that has half precision says so in FLT_EVAL_METHOD, which changes no double."""
+    command = c_compiler()
+    if platform.machine() not in ("x86_64", "AMD64"):
+        pytest.skip("these are processors of another kind")
+    unit = tmp_path / "unit.c"
+    unit.write_text('#include "signals.h"\nextern int something;\n')
+    unused = ("-Wno-unused-function", "-Wno-unused-const-variable")
+    ran(
+        *command,
+        "-O3",
+        f"-march={processor}",
+        "-Wundef",
+        *WARNINGS,
+        *unused,
+        f"-I{building.FOLDER}",
+        "-c",
+        unit,
+        "-o",
+        os.devnull,
+    )
+
+
 @pytest.mark.parametrize("flag", ["-ffast-math", "-Ofast"])
 def test_headers_refuse_fast_mathematics(flag: str, tmp_path: Path) -> None:
     """Whoever compiles the C files with his own tools is told too."""
@@ -204,13 +246,13 @@ def test_a_named_compiler_that_is_missing_is_reported(tmp_path: Path, no_flags: 
 def test_zig_is_taken_where_the_machine_has_no_compiler(tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
     no_flags.setenv("PATH", str(tmp_path))
     no_flags.setattr(building.importlib.util, "find_spec", lambda name: object())
-    assert building.compiler() == [sys.executable, "-m", "ziglang", "cc"]
+    assert building.compiler() == [sys.executable, "-P", "-m", "ziglang", "cc"]
 
 
 def test_only_zig_builds_for_other_machines(tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
     no_flags.setenv("CC", "gcc")
     no_flags.setattr(building.importlib.util, "find_spec", lambda name: object())
-    command, target = [sys.executable, "-m", "ziglang", "cc"], "aarch64-linux-musl"
+    command, target = [sys.executable, "-P", "-m", "ziglang", "cc"], "aarch64-linux-musl"
     assert building.compiler(target) == command
     assert {"-mcpu=baseline", "-target", target} <= set(building.flags(command, target=target))
     no_flags.setattr(building.importlib.util, "find_spec", lambda name: None)

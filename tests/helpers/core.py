@@ -74,7 +74,7 @@ def zig() -> list[str]:
     """Return the command of zig's C compiler, or skip the test."""
     if importlib.util.find_spec("ziglang") is None:
         pytest.skip("needs zig: python -m pip install ziglang")
-    return [sys.executable, "-m", "ziglang", "cc"]
+    return [sys.executable, "-P", "-m", "ziglang", "cc"]
 
 
 def highest_level() -> str:

@@ -282,6 +282,14 @@ def test_what_leads_libhdf5_astray_ends_in_time_and_within_the_memory(change, me
     assert megabytes < 150 + 3 * 64  # what Python, numpy and h5py take, and three times the room of the file
 
 
+def test_reading_runs_no_module_of_the_current_folder(tmp_path, monkeypatch):
+    WRITERS["x.sofa"](tmp_path / "x.sofa")
+    (tmp_path / "json.py").write_text("open('ran', 'w')\nfrom sys import exit\nexit()\n")
+    monkeypatch.chdir(tmp_path)
+    assert read_path(tmp_path / "x.sofa").samples.size
+    assert not (tmp_path / "ran").exists()
+
+
 def test_a_sampling_rate_that_is_none_is_refused(tmp_path):
     np.savez(tmp_path / "x.npz", noise=signal(), fs=1e-310)
     with pytest.raises(ValueError, match=r"rate that .*x\.npz states must be a sampling rate from"):
