@@ -5,9 +5,10 @@
  */
 static const real BLUR = 16, LEAST_NOISE = 2;
 /* P fades until its largest variance is WIDEST times the usual one along the rows. From then on,
- * state noise of the same size along the rows takes the place of fading, so that the others hardly
- * grow. The usual variance falls by at most e^FALL while a row passes, so that a bad sample does
- * not count, and rises with RELEASE of the fading. */
+ * state noise of the same size along the rows takes the place of fading, and P is scaled down so
+ * far that the largest variance stays. The usual variance falls by at most e^FALL while a row
+ * passes, so that a bad sample does not count, and rises with RELEASE of the fading; it waits while
+ * the rows tell nothing. */
 static const real WIDEST = 1e4, FALL = 4, RELEASE = (real)0.0625;
 /* The usual variance is known when h'P h first exceeds TELLING of q. Before, the signal may be so
  * soft that P must grow, up to UNKNOWN times the variance at the start: any further, and the
@@ -75,11 +76,12 @@ void predict(covariance *c, real fading, real r)
     owed_numbers *owed = c->owed;
     if (fading > 1) {
         const real most = owed->usual > 0 ? WIDEST * owed->usual : UNKNOWN * owed->largest;
-        owed->usual *= 1 + (fading - 1) * RELEASE;
+        owed->release = (fading - 1) * RELEASE;
         if (owed->scale * owed->bound > most) owed->bound = largest_variance(c);
         if (owed->scale * owed->bound > most) {
-            r += (fading - 1) * owed->usual;
-            fading = 1;
+            const real noise = (fading - 1) * owed->usual;
+            fading = 1 - noise / (owed->scale * owed->bound);
+            r += noise;
         }
     }
     owed->scale *= fading;
@@ -205,7 +207,9 @@ static void note_usual(const covariance *c, real variance, real energy, real q)
     owed_numbers *owed = c->owed;
     if (!(energy > 0 && variance > TELLING * q)) return;
     const real along = variance / energy, fall = 1 / (1 + FALL / (real)c->n);
-    owed->usual = owed->usual > 0 ? held_value(owed->usual, along, fall, 1) : along;
+    const real last = owed->usual * (1 + owed->release);
+    owed->usual = last > 0 ? held_value(last, along, fall, 1) : along;
+    owed->release = 0; /* once a sample */
 }
 
 real project(covariance *c, real q)

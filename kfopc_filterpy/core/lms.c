@@ -41,17 +41,25 @@ const anc_algorithm anc_fxlms = {
     .name = "FxLMS", .settings = fxlms, .control_signal = filtered_signal, .update = update_fxlms};
 
 /* FxNLMS: w(n+1) = w(n) + mu e(n) x'(n) / (epsilon + x'(n)'x'(n)), with the energy of all filtered
- * references. If epsilon is 0, the energy counts as at least QUIET of the usual one: else the
- * weights would follow the noise of the microphones in a quiet passage. The usual energy follows a
- * louder signal within a filter length, by at most e^RISE, so that a bad sample does not count, and
- * a softer one within HELD filter lengths. */
+ * references. A soft reference teaches little but the noise of the microphones. So if epsilon is 0,
+ * two things hold.
+ *
+ * The energy counts as at least QUIET of the usual one, which follows a louder signal within a
+ * filter length, by at most e^RISE, so that a bad sample does not count, and a softer one within
+ * HELD filter lengths.
+ *
+ * When a reference is UNHEARD times as loud as those that the weights were learned of, they begin
+ * anew. What they were learned of follows within HELD filter lengths, and at first, while the
+ * weights are younger than YOUNG filter lengths, a louder reference at once. */
 
 enum { REGULARIZATION = STEP_SIZE + 1 };
-static const real QUIET = (real)1e-3, RISE = 4, HELD = 1000;
+static const real QUIET = (real)1e-3, RISE = 4, HELD = 1000, UNHEARD = (real)1e4, YOUNG = 2;
 typedef struct {
     signals s;
-    real *usual; /* energy */
-    real *over;  /* what the step size is divided by */
+    real *usual;   /* energy of the filtered references */
+    real *learned; /* energy of the references that the weights were learned of */
+    real *age;     /* of the weights, in samples */
+    real *over;    /* what the step size is divided by */
 } normalised;
 static const anc_setting fxnlms[] = {
     {"step_size", 0, 0, ANC_ONE}, {"regularization", 0, 0, ANC_ONE}, {0}};
@@ -61,7 +69,27 @@ static void layout_fxnlms(anc_view *view, const anc_plan *plan, anc_layout *at)
     normalised *f = (normalised *)view;
     (void)plan;
     f->usual = reals(at, "usual_energy", ANC_STATE, 1, 1, 1, 1);
+    f->learned = reals(at, "learned_energy", ANC_STATE, 1, 1, 1, 1);
+    f->age = reals(at, "age", ANC_STATE, 1, 1, 1, 1);
     f->over = reals(at, "regularized_energy", ANC_SCRATCH, 1, 1, 1, 1);
+}
+
+static int fxnlms_signal(anc_view *view, const real *reference, real *control)
+{
+    normalised *f = (normalised *)view;
+    signals *s = &f->s;
+    const int refused = take_reference(s, reference);
+    if (refused) return refused;
+    real x2 = 0;
+    for (int32_t i = 0; i < s->I; i++) x2 += *newest(&s->x, i) * *newest(&s->x, i);
+    const int unheard = *f->learned > 0 && x2 * (real)s->L > UNHEARD * *f->learned;
+    if (unheard && *s->setting[REGULARIZATION] == 0) {
+        clear(s->weights, times(s->S, states(s)));
+        *f->learned = 0;
+        *f->age = 0;
+    }
+    emit_all(s, control);
+    return ANC_DONE;
 }
 
 static lms_step fxnlms_step(const signals *s, int32_t sj)
@@ -76,20 +104,24 @@ static int update_fxnlms(anc_view *view, const real *error)
     normalised *f = (normalised *)view;
     const signals *s = &f->s;
     if (!error) return ANC_DONE;
-    const real energy = energy_of(s, &s->filtered, 0, s->filtered.rows) +
-                        energy_of(s, &s->guarded, 0, s->guarded.rows);
-    const real usual = *f->usual > 0 ? *f->usual : energy, L = (real)s->L;
+    const real energy = filtered_energy(s), heard = energy_of(s, &s->x, 0, s->I), L = (real)s->L;
+    const real usual = *f->usual > 0 ? *f->usual : energy, slow = 1 / (HELD * L);
     const real epsilon = *s->setting[REGULARIZATION];
     *f->over = epsilon > 0 ? epsilon + energy : larger(energy, QUIET * usual);
     const int refused = update(view, error, fxnlms_step);
-    if (!refused) *f->usual = held_value(usual, energy, 1 - 1 / (HELD * L), 1 + RISE / L);
-    return refused;
+    if (refused) return refused;
+    *f->usual = held_value(usual, energy, 1 - slow, 1 + RISE / L);
+    if (heard == 0) return ANC_DONE; /* nothing is learned of silence */
+    *f->learned = *f->age < YOUNG * L ? larger(*f->learned, heard)
+                                      : held_value(*f->learned, heard, 1 - slow, 1 + slow);
+    *f->age += 1;
+    return ANC_DONE;
 }
 
 const anc_algorithm anc_fxnlms = {.name = "FxNLMS",
                                   .settings = fxnlms,
                                   .layout = layout_fxnlms,
-                                  .control_signal = filtered_signal,
+                                  .control_signal = fxnlms_signal,
                                   .update = update_fxnlms};
 
 /* Leaky FxLMS: w(n+1) = (1 - mu gamma) w(n) + mu e(n) x'(n). */

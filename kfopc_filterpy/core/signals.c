@@ -228,16 +228,20 @@ void emit(signals *s, int32_t sj, real y)
     *newest(&s->y, sj) = anc_amplify(s->amplifier + sj, y);
 }
 
-int filtered_signal(anc_view *view, const real *reference, real *control)
+void emit_all(signals *s, real *control)
 {
-    signals *s = (signals *)view;
-    const int refused = take_reference(s, reference);
-    if (refused) return refused;
     for (int32_t sj = 0; sj < s->S * s->J; sj++) {
         emit(s, sj, filter_output(s, sj));
         control[sj] = s->control[sj];
     }
-    return ANC_DONE;
+}
+
+int filtered_signal(anc_view *view, const real *reference, real *control)
+{
+    signals *s = (signals *)view;
+    const int refused = take_reference(s, reference);
+    if (!refused) emit_all(s, control);
+    return refused;
 }
 
 real heard_output(const signals *s, const lines *rows, int32_t scenario, int32_t k)
@@ -256,6 +260,12 @@ real energy_of(const signals *s, const lines *rows, int32_t first, int32_t count
     for (int32_t row = first; row < first + count; row++)
         sum += dot(newest(rows, row), newest(rows, row), s->L);
     return sum;
+}
+
+real filtered_energy(const signals *s)
+{
+    return energy_of(s, &s->filtered, 0, s->filtered.rows) +
+           energy_of(s, &s->guarded, 0, s->guarded.rows);
 }
 
 /* Set d^_k = e_k + sum_j s^_kj * y_j of a microphone of a scenario. */
@@ -364,8 +374,7 @@ static int is_calm(const signals *s, const real *error)
  * Return whether all steps are short enough. */
 static int bound_steps(signals *s, const real *error)
 {
-    const real energy = energy_of(s, &s->filtered, 0, s->filtered.rows) +
-                        energy_of(s, &s->guarded, 0, s->guarded.rows);
+    const real energy = filtered_energy(s);
     const real x2 = energy_of(s, &s->x, 0, s->I), size = root(energy);
     for (int32_t sj = 0; sj < s->S * s->J; sj++) {
         lms_step *step = s->step + sj;

@@ -9,7 +9,7 @@ import numpy as np
 
 GROUP = 8  # rows of T that have one length, `PARTS` in vectors.h
 OWED = np.dtype(
-    [(name, np.float64) for name in ("scale", "diagonal", "pending", "largest", "bound", "floored", "usual")]
+    [(name, np.float64) for name in ("scale", "diagonal", "pending", "largest", "bound", "floored", "usual", "release")]
 )
 
 

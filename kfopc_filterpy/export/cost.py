@@ -34,7 +34,7 @@ def operations(block: Block) -> str:
     else:
         learning = n * (K * (3 if guarded else 1) + IN_ALL.get(algorithm, 0))
         if algorithm == "fxnlms":
-            learning += rows * n  # the energy of x', and below in MOV-MFxLMS
+            learning += rows * n + s.references * s.taps  # the energies of x' and of x
         if algorithm in ("mov", "mov_fixed") and block.fields["modified"].item():
             learning += K * n
     return f"{filtering + learning:,} multiplications and as many additions"
