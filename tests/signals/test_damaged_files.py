@@ -283,10 +283,10 @@ def test_what_leads_libhdf5_astray_ends_in_time_and_within_the_memory(change, me
 
 
 def test_reading_runs_no_module_of_the_current_folder(tmp_path, monkeypatch):
-    WRITERS["x.sofa"](tmp_path / "x.sofa")
+    WRITERS["packed.mat"](tmp_path / "packed.mat")
     (tmp_path / "json.py").write_text("open('ran', 'w')\nfrom sys import exit\nexit()\n")
     monkeypatch.chdir(tmp_path)
-    assert read_path(tmp_path / "x.sofa").samples.size
+    assert read_path(tmp_path / "packed.mat").samples.size
     assert not (tmp_path / "ran").exists()
 
 
