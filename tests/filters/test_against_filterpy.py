@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filterpy.common import Saver
 from helpers.filterpys import Oracle
 from hypothesis import note, settings
 from hypothesis import strategies as st
@@ -295,6 +296,14 @@ class Twins(RuleBasedStateMachine):
             self.leave(before)
             before.x[:] = before.P[:] = 7.0
         self.oracle = copy.deepcopy(self.oracle)
+
+    @rule()
+    def save(self) -> None:
+        """filterpy's `Saver` keeps what the attributes are now, whatever is written into them later."""
+        savers = self.both(0, lambda kf, _: Saver(kf, save_current=True))
+        self.both(0, lambda kf, rng: self.write(kf, rng, "P *="))
+        for name in (*STATE, *OTHERS):
+            self.require_same(*(getattr(saver, name)[0] for saver in savers), name)
 
     # Refusals, and what changes nothing.
 

@@ -112,21 +112,6 @@ def test_what_may_surprise_is_as_in_filterpy(code: str) -> None:
     assert exactly(*each) == exactly(*own)
 
 
-def test_a_batch_names_the_step_that_was_refused_and_saves_those_before() -> None:
-    class Counted:
-        saved = 0
-
-        def save(self) -> None:
-            self.saved += 1
-
-    kf, saver = names["make"](KFOPC), Counted()
-    zs = np.ones((4000, 2, 1))
-    zs[3210, 1] = np.nan
-    with pytest.raises(ValueError, match=r"step 3210 of the batch: z must be finite.* \(first at index \(1, 0\)\)"):
-        kf.batch_filter(zs, saver=saver)
-    assert saver.saved == 3210
-
-
 @pytest.mark.parametrize("R", [2.0, None, [[3.0]]])
 def test_an_R_that_does_not_fit_the_rows_of_H_is_named(R: Any) -> None:
     with pytest.raises(ValueError, match=r"R must have shape \(2, 2\), as H has rows, got .* for dim_z = 1"):

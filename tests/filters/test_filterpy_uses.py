@@ -6,6 +6,7 @@ The steps themselves are compared in `test_against_filterpy.py`. The page's last
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,34 +48,6 @@ def numbers(kind: type) -> list:
     return [means, covariances, kf.P, *kf.rts_smoother(means, covariances, Fs=[kf.F] * len(Z))]
 
 
-def saved(kind: type) -> list:
-    kf = constant_velocity(kind)
-    saver = Saver(kf)
-    for z in Z:
-        kf.predict()
-        kf.update(z)
-        saver.save()
-        kf.P *= 1.1  # what was saved stays
-    saver.to_array()
-    names = ("x", "P", "K", "y", "S", "P_prior", "P_post", "likelihood", "log_likelihood", "z", "Q", "H")
-    return [getattr(saver, name) for name in names]
-
-
-def inverses(kind: type) -> list:
-    seen = []
-    for inverse in (np.linalg.pinv, inv_diagonal):
-        kf = constant_velocity(kind)
-        kf.inv = inverse
-        for z in Z[:10]:
-            kf.predict()
-            kf.update(z)
-        kf.H, kf.R = np.zeros((1, 2)), np.zeros((1, 1))
-        if inverse is np.linalg.pinv:
-            kf.update(3.0)  # S = 0: a pseudo-inverse has an answer, which is kept
-        seen += [kf.x, kf.P, kf.SI]
-    return seen
-
-
 def pair_of_models(kind: type) -> list[Any]:
     """Constant acceleration, with much noise and with little."""
     filters = []
@@ -86,18 +59,6 @@ def pair_of_models(kind: type) -> list[Any]:
         kf.F, kf.Q = np.array([[1, 0.1, 0.005], [0, 1, 0.1], [0, 0, 1]]), Q_discrete_white_noise(3, 0.1, var)
         filters.append(kf)
     return filters
-
-
-def interacting_models(kind: type, estimator: type = IMMEstimator) -> list:
-    filters = pair_of_models(kind)
-    bank = estimator(filters, (0.5, 0.5), np.array([[0.97, 0.03], [0.03, 0.97]]))
-    saver, seen = Saver(bank, ignore=("filters",)), []
-    for z in Z:
-        bank.predict()
-        bank.update(np.array([z]))
-        saver.save()
-        seen += [bank.x, bank.P, bank.mu, filters[0].x, filters[1].P, filters[0].likelihood]
-    return seen
 
 
 def multiple_models(kind: type) -> list:
@@ -135,11 +96,8 @@ def procedural(kind: type) -> list:
 USES: dict[str, Callable[[type], list]] = {
     "`batch_filter`, `rts_smoother`": numbers,
     "`FixedLagSmoother`": fixed_lag,
-    "`Saver`": saved,
-    "`IMMEstimator`": interacting_models,
     "`MMAEFilterBank`": multiple_models,
     "`predict`, `update`, `batch_filter`, `rts_smoother` as functions": procedural,
-    "`inv`": inverses,
 }
 IN_THE_MACHINE = [
     "`predict`, `update`",
@@ -150,6 +108,7 @@ IN_THE_MACHINE = [
     "`residual_of`, `log_likelihood_of`, `measurement_of_state`",
     "`copy`, `deepcopy`, `pickle`",
     "`alpha`",
+    "`Saver`",
 ]
 
 
@@ -160,66 +119,70 @@ def test_a_filterpy_use_gives_the_same_bits(use: str) -> None:
     assert expected, "the use saw nothing"
 
 
-def random_walks(kind: type, variances: tuple[float, ...]) -> list[Any]:
-    if kind is KFOPC:
-        return [KFOPC.random_walk(2, state_noise=r, measurement_noise=0.5) for r in variances]
-    filters = [Oracle(2, 1) for _ in variances]
-    for kf, r in zip(filters, variances, strict=True):
-        kf.Q, kf.R = r * np.eye(2), np.array([[0.5]])
-    return filters
+# Uses that have a random walk, too: they get a function that makes a filter with a state noise.
 
 
-def walk_saved(kind: type) -> list:
-    (kf,) = random_walks(kind, (1e-3,))
-    saver, rng = Saver(kf), np.random.default_rng(0)
-    for z in (*Z[:9], None, *Z[9:20]):
-        kf.predict()
-        kf.update(z if z is None else np.array([[z]]), H=rng.normal(size=(1, 2)))
-        saver.save()
-        kf.P *= 1.1
-    del saver._DL["z"], saver.__dict__["z"]  # None and numbers
-    saver.to_array()
-    return [
-        getattr(saver, name) for name in ("x", "P", "K", "y", "S", "SI", "P_prior", "P_post", "Q", "R", "F", "x_prior")
-    ]
-
-
-def walk_bank(kind: type) -> list:
-    filters = random_walks(kind, (1e-4, 1e-1))
-    for kf in filters:
-        kf.H = np.array([[1.0, 0.5]])
-    bank = IMMEstimator(filters, (0.5, 0.5), np.array([[0.97, 0.03], [0.03, 0.97]]))
-    seen = []
-    for z in Z[:30]:
+def interacting_models(make: Callable[[float], Any], estimator: type = IMMEstimator) -> list:
+    bank = estimator([make(1e-4), make(1e-1)], (0.5, 0.5), np.array([[0.97, 0.03], [0.03, 0.97]]))
+    saver, seen = Saver(bank, ignore=("filters",)), []
+    for z in Z:
         bank.predict()
         bank.update(np.array([[z]]))
-        seen += [bank.x, bank.P, bank.mu]
+        saver.save()
+        seen += [bank.x, bank.P, bank.mu, bank.filters[0].x, bank.filters[1].P, bank.filters[0].likelihood]
     return seen
 
 
-def walk_inverse(kind: type) -> list:
-    (kf,) = random_walks(kind, (0.5,))
-    kf.inv = np.linalg.pinv
-    for H in (np.zeros((1, 2)), np.array([[1.0, 2.0]])):
-        kf.predict()
-        kf.update(np.array([[1.0]]), H=H, R=np.zeros((1, 1)))  # silent: a pseudo-inverse has a gain of 0
-    return [kf.x, kf.P]
+def inverses(make: Callable[[float], Any]) -> list:
+    seen = []
+    for inverse in (np.linalg.pinv, inv_diagonal):
+        kf = make(0.5)
+        kf.inv = inverse
+        for z in Z[:10]:
+            kf.predict()
+            kf.update(np.array([[z]]))
+        if inverse is np.linalg.pinv:
+            kf.update(np.array([[3.0]]), H=np.zeros((1, 2)), R=np.zeros((1, 1)))  # S = 0: its gain is 0
+        seen += [kf.x, kf.P, kf.SI]
+    return seen
 
 
-@pytest.mark.parametrize("use", [walk_saved, walk_bank, walk_inverse])
-def test_a_filterpy_use_of_the_random_walk_gives_the_same_numbers(use: Callable[[type], list]) -> None:
-    for theirs, ours in zip(use(Oracle), use(KFOPC), strict=True):
+def make_general(kind: type, r: float) -> Any:
+    kf = kind(2, 1)
+    kf.Q, kf.R, kf.H = r * np.eye(2), np.array([[0.5]]), np.array([[1.0, 0.5]])
+    return kf
+
+
+def make_walk(r: float) -> Any:
+    kf = KFOPC.random_walk(2, state_noise=r, measurement_noise=0.5)
+    kf.H = np.array([[1.0, 0.5]])
+    return kf
+
+
+OF_WALKS = {"`IMMEstimator`": interacting_models, "`inv`": inverses}
+
+
+@pytest.mark.parametrize("use", OF_WALKS)
+def test_a_filterpy_use_gives_the_same_bits_and_with_the_random_walk_the_same_numbers(use: str) -> None:
+    expected, got = (OF_WALKS[use](partial(make_general, kind)) for kind in (Oracle, KFOPC))
+    assert same(expected, got)
+    for theirs, ours in zip(expected, OF_WALKS[use](make_walk), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-11)
 
 
 def test_the_page_lists_these_uses() -> None:
     page = (ROOT / "docs" / "filterpy.md").read_text(encoding="utf-8")
-    assert {row[0] for row in table_of(page, "Parts of filterpy that were compared")} == {*IN_THE_MACHINE, *USES}
+    assert {row[0] for row in table_of(page, "Parts of filterpy that were compared")} == {
+        *IN_THE_MACHINE,
+        *USES,
+        *OF_WALKS,
+    }
 
 
 def test_the_imm_of_the_fork_runs_KFOPCs() -> None:
     fork = pytest.importorskip("bayesian_filters.kalman", reason="needs bayesian-filters (the extra `test`)")
-    assert same(*(interacting_models(kind, fork.IMMEstimator) for kind in (fork.KalmanFilter, KFOPC)))
+    makers = (partial(make_general, kind) for kind in (fork.KalmanFilter, KFOPC))
+    assert same(*(interacting_models(make, fork.IMMEstimator) for make in makers))
 
 
 def test_the_smoother_takes_gaps_and_the_inputs_that_filterpys_leaves_out() -> None:
