@@ -77,17 +77,8 @@ def test_every_python_that_is_started_ignores_the_current_folder():
 
 
 PARTS = [
-    "filters",
-    "power",
-    "controllers",
-    "paths",
-    "signals",
-    "bounds",
-    "metrics",
-    "export",
-    "realtime",
-    "plot",
-    "verdict",
+    *("filters", "power", "controllers", "paths", "signals", "bounds"),
+    *("metrics", "export", "realtime", "plot", "verdict"),
 ]
 
 

@@ -89,14 +89,6 @@ def test_a_misspelt_key_is_refused(tmp_path: Path, old: str, new: str, says: str
         read_task(tmp_path / "changed.toml")
 
 
-def test_a_change_of_the_primary_path_is_heard_at_its_time() -> None:
-    steady, changed = (read_task(FOLDER / f"bandpass{name}.toml") for name in ("", "-change"))
-    ratio = changed.disturbances[1] / np.sqrt(2.0) / (steady.disturbances[1] / 2.0)  # the powers differ by 2 to 4
-    heard = np.abs(steady.disturbances[1]) > 1e-3
-    expected = np.where(np.arange(ratio.size) < 8000, 1.0, -1.0)
-    np.testing.assert_allclose(ratio[heard], expected[heard], rtol=1e-9)
-
-
 def test_a_task_without_its_data_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tasks, "measured_data", lambda: None)
     with pytest.raises(LeftOut, match="set KFOPC_DATA"):

@@ -13,7 +13,7 @@ from helpers.studies import plain_run, smaller
 from scipy import stats
 
 from comparisons.__main__ import main
-from comparisons.bench import Runs, Scene, algorithms, tune
+from comparisons.bench import Scene, algorithms
 from comparisons.studies.cases import FS, SWITCH_ON_S, make_case, noises, plants
 from comparisons.sweep import scenario, study
 from comparisons.sweep.scenario import DEFAULTS, checked_axes, in_the_loop, scene_of
@@ -152,12 +152,6 @@ def test_a_scheduler_that_is_not_there_is_refused(tmp_path):
         run_sweep(plane, AXES, tmp_path / "rows", scheduler="tcp://127.0.0.1:9")
 
 
-def test_without_dask_a_scheduler_says_what_to_install(uninstall, tmp_path):
-    uninstall("distributed")
-    with pytest.raises(ModuleNotFoundError, match="a scheduler needs Dask: python -m pip install"):
-        run_sweep(plane, AXES, tmp_path / "rows", scheduler="tcp://127.0.0.1:9")
-
-
 # The built-in scenario.
 
 
@@ -209,15 +203,6 @@ def test_the_rated_power_is_relative_to_what_the_unconstrained_filter_needs():
     settings = {"n_taps": 32, "rated_power": 1.0, "switch_on_s": SWITCH_ON_S, "ridge": ridge}
     bound = power_constrained_wiener(scene.references[0], duct_plant(fs=scene.fs), **settings)
     assert bound.unconstrained.control_power == pytest.approx(1.0, rel=1e-6)  # least squares of 16000 samples
-
-
-def test_a_setting_that_is_tuned_is_the_winner_of_the_studies_rule():
-    values = DEFAULTS | SMALL | {"noise": "tone", "setting": "tuned", "seed": 1}
-    for algorithm in ("FxLMS", "leaky FxLMS"):
-        best = tune(Runs(), scene_of(values | {"seed": scenario.TUNING_SEED}), [algorithm])[algorithm].setting
-        figures = in_the_loop(values | {"algorithm": algorithm})
-        used = figures["setting_used"], figures.get("second_setting_used")
-        assert used == (best if isinstance(best, tuple) else (best, None))
 
 
 def test_what_diverges_has_no_figures_of_merit():

@@ -6,14 +6,8 @@ import dataclasses
 import numpy as np
 
 SIGNALS = (
-    "error",
-    "control_signal",
-    "amplifier_output",
-    "anti_noise",
-    "constraint_factor",
-    "disturbance_power",
-    "secondary_path_gain",
-    "weights",
+    *("error", "control_signal", "amplifier_output", "anti_noise"),
+    *("constraint_factor", "disturbance_power", "secondary_path_gain", "weights"),
 )
 
 
@@ -21,14 +15,6 @@ def assert_same_run(one, two):
     """Every field of two results, to the bit."""
     for field in dataclasses.fields(one):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name), err_msg=field.name)
-
-
-def numbers_of(value):
-    """Copies of all arrays in a tuple of tuples, records as plain arrays."""
-    if isinstance(value, np.ndarray):
-        names = value.dtype.names
-        return [value.copy()] if names is None else [np.array(value[name], dtype=float) for name in names]
-    return [leaf for item in value for leaf in numbers_of(item)] if isinstance(value, tuple) else []
 
 
 def assert_goes_on_as(made, other):

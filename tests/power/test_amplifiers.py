@@ -20,7 +20,6 @@ from kfopc_filterpy.power.amplifiers import compiled_model
 
 signals = st.floats(-1e9, 1e9)
 limits = st.floats(1e-3, 1e3)
-sharpnesses = st.floats(0.1, 100.0)
 
 
 def make(limit, sharpness):
