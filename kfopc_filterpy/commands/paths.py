@@ -67,7 +67,7 @@ def identify(options: argparse.Namespace) -> int:
             "identify a shorter impulse response, or record for longer"
         )
     found = estimate_path(sent[:shortest], heard[:shortest], options.taps, files.fs)
-    _judge_residual(options, found.residual_db, files.fs, shortest)
+    _judge_residual(options, found.residual_db, files.fs, sent[:shortest], heard[:shortest])
     _write_path(options.output, found.taps, files.fs)
     facts = {"n_taps": options.taps, "fs": files.fs, "residual_db": float(found.residual_db), "output": options.output}
     text = f"{options.output}: {options.taps} taps, which leave {found.residual_db:.1f} dB of the response unexplained"
@@ -75,22 +75,35 @@ def identify(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _judge_residual(options: argparse.Namespace, residual_db: float, fs: float, n_samples: int) -> None:
-    """Raise ValueError if a fit explains hardly more of a response than chance would; warn if it explains little."""
+def _judge_residual(
+    options: argparse.Namespace, residual_db: float, fs: float, sent: np.ndarray, heard: np.ndarray
+) -> None:
+    """Raise ValueError if a fit explains hardly more than chance would, or two clocks show; warn if it explains little."""
+    from ..paths.timing import timing_fault
+    from ..signals.quality import clipping_remarks
+
+    if residual_db <= POOR_DB:
+        return
     share = 1.0 - 10 ** (residual_db / 10)
     explained = f"explains {100 * max(share, 0.0):.1f} % of {options.response}"
-    if share < max(UNRELATED, CHANCE * options.taps / n_samples):
+    if fault := timing_fault(sent, heard, fs, (options.excitation, options.response)):
+        raise ValueError(f"{options.excitation} {explained}: {fault} Nothing was written")
+    if share < max(UNRELATED, CHANCE * options.taps / sent.size):
         raise ValueError(
             f"{options.excitation} {explained}, hardly more than chance would: are the files swapped, or of different "
             "recordings? Give what was sent to the amplifier first, then what the microphone heard at the same time; "
             "nothing was written"
         )
-    if residual_db > POOR_DB:
-        warn(
-            options,
-            f"{options.excitation} {explained} only: play it louder or wait for silence, check that nothing is "
-            f"clipped, and give more --taps if the impulse response is longer than {1e3 * options.taps / fs:.3g} ms",
-        )
+    clipped = clipping_remarks(sent, options.excitation) + clipping_remarks(heard, options.response)
+    warn(
+        options,
+        f"{options.excitation} {explained} only: "
+        + (
+            " ".join(clipped)
+            or f"{residual_db:.1f} dB are noise, or come later than {1e3 * options.taps / fs:.3g} ms; play it louder or wait "
+            "for silence, or give more --taps"
+        ),
+    )
 
 
 def inspect(options: argparse.Namespace) -> int:

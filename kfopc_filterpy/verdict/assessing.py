@@ -42,6 +42,7 @@ from kfopc_filterpy.paths import (
 )
 from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.file_checks import require_different, require_heard, require_sound
+from kfopc_filterpy.paths.timing import timing_fault
 from kfopc_filterpy.paths.uncertainty import Uncertainty, as_uncertainty
 from kfopc_filterpy.plant import Plant, as_constant_plant, checked_signals
 from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_remarks
@@ -321,6 +322,9 @@ def assess(
         response_s=None if p is None else _response_s(p, s, want_db, fs),
         feedback=n_heard == 0,
         loop=loop,
+        timing_fault=timing_fault(np.atleast_2d(x)[0], np.atleast_2d(d)[0], fs, ("noise", "disturbance"))
+        if disturbance is not None and cause in ("coherence", "causality")
+        else None,
     )
     return replace(assessment, advice=tuple(advice_on(assessment)))
 

@@ -179,6 +179,9 @@ class Assessment:
         Whether there is no reference microphone.
     loop : FeedbackMargin or None
         Stability of the settled loop of a feedback or hybrid controller; None otherwise, or if the run diverged.
+    timing_fault : str or None
+        What is wrong with the timing of the recordings (clocks that differ, lost samples, swapped files), if coherence or
+        causality limits and they show it.
     origin : dict of str to str
         What the page says of where it comes from: the command, and each file.
     """
@@ -213,6 +216,7 @@ class Assessment:
     response_s: float | None = None
     feedback: bool = False
     loop: FeedbackMargin | None = None
+    timing_fault: str | None = None
     origin: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -373,6 +377,8 @@ def advice_on(verdict: Assessment, *, fs: str = "fs=", n_taps: str = "n_taps=") 
     enough = [f"About {verdict.power(needed)} would do for {want}: the least with which the run reaches it."]
     if verdict.enough:
         return enough if np.max(needed / verdict.limits.rated_power) < 0.9 else []
+    if verdict.timing_fault is not None:
+        return [verdict.timing_fault[0].upper() + verdict.timing_fault[1:]]
     if verdict.limited_by == "coherence":
         return [
             "Move the reference microphone closer to the source, or add one for each source; shield it from wind and "

@@ -1,0 +1,95 @@
+"""Why a recording explains another badly: clocks that drift, samples that are missing, or files that are swapped."""
+
+from __future__ import annotations
+
+import numpy as np
+
+_SEGMENT_S, _LEAST_SEGMENTS, _MOST_SEGMENTS = 1.0, 8, 64
+_LEAST_DELAY = 0.5  # samples by which the delay must change over a record
+_LEAST_GAIN = 0.8  # of the power left unexplained, once the delay is put right: what does less is not the cause
+_LEAST_LEAD = 0.5  # of a response's energy that comes before time 0: the files are swapped
+_SPECTRUM = 4096  # samples of a spectrum's segments at most
+_FLOOR = 1e-3  # of the mean power, added to a spectrum that is divided by
+
+
+def timing_fault(sent: np.ndarray, heard: np.ndarray, fs: float, names: tuple[str, str]) -> str | None:
+    """Return what is wrong with the timing of two recordings (n_samples,), as a sentence with its number; None if nothing is.
+
+    The response from one to the other is estimated in segments of about a second. Its delay rises evenly if the clocks
+    differ, and jumps where samples are missing. A cause is named only if putting it right leaves clearly less unexplained.
+    Sweeps, of which each segment has another band, show no drift.
+    """
+    from scipy.ndimage import map_coordinates
+
+    n = min(sent.size, heard.size)
+    count = int(np.clip(n / (_SEGMENT_S * fs), _LEAST_SEGMENTS, _MOST_SEGMENTS))
+    size = n // count
+    if size < 64:
+        return None
+    sent, heard = sent[: count * size] - np.mean(sent), heard[: count * size] - np.mean(heard)
+    first, second = names
+    delays = _delays(sent.reshape(count, size), heard.reshape(count, size))
+    times = (np.arange(count) + 0.5) * size
+    slope, start = np.polyfit(times, delays, 1)
+    splits = [np.concatenate([part - part.mean() for part in np.split(delays, [at])]) for at in range(1, count)]
+    at = 1 + int(np.argmin([np.sum(left**2) for left in splits]))
+    jump = round(float(np.median(delays[at:]) - np.median(delays[:at])))
+    n_samples, left, cause = sent.size, _unexplained(sent, heard), ""
+    if jump and np.sum(splits[at - 1] ** 2) < np.sum((delays - start - slope * times) ** 2):
+        places = np.arange(n_samples) + np.where(np.arange(n_samples) < at * size, 0, jump)
+        cause = (
+            f"from about {at * size / fs:.2g} s on, {second} is {abs(jump)} samples {'later' if jump > 0 else 'earlier'} than "
+            "before: a block was lost, so record both again in one stream, or cut both there."
+        )
+    elif abs(slope) * n_samples >= _LEAST_DELAY:
+        places = np.arange(n_samples) * (1 + slope)
+        cause = (
+            f"the delay of {second} drifts by {slope * n_samples:+.1f} samples, so the clocks differ by {1e6 * slope:+.1f} ppm: "
+            "record both with one interface, or with a common clock."
+        )
+    if cause and _unexplained(sent, map_coordinates(heard, [places], order=3)) < _LEAST_GAIN * left:
+        return cause
+    lead = _lead(sent, heard) if left < _LEAST_LEAD else 0
+    return f"{second} comes {1e3 * lead / fs:.3g} ms before {first}: are the files swapped?" if lead else None
+
+
+def _unexplained(sent: np.ndarray, heard: np.ndarray) -> float:
+    """Return the share of a recording's power that its coherence with another leaves unexplained."""
+    from scipy.signal import coherence, welch
+
+    segment = min(_SPECTRUM, sent.size // 16)
+    power = welch(heard, nperseg=segment)[1]
+    return float(np.sum((1 - coherence(sent, heard, nperseg=segment)[1]) * power) / np.sum(power))
+
+
+def _responses(sent: np.ndarray, heard: np.ndarray) -> np.ndarray:
+    """Return the impulse responses between segments (n_segments, size), from time 0 to the middle, then from before time 0."""
+    window = np.hanning(sent.shape[-1])
+    x, d = (np.fft.rfft(window * one, 2 * one.shape[-1]) for one in (sent, heard))
+    power = np.abs(x) ** 2
+    return np.fft.irfft(np.conj(x) * d / (power + _FLOOR * np.mean(power)))
+
+
+def _delays(sent: np.ndarray, heard: np.ndarray) -> np.ndarray:
+    """Return the delay of each segment, in samples from that of the loudest, by comparing their responses."""
+    spectra = np.fft.rfft(_responses(sent, heard))
+    similar = np.fft.irfft(np.conj(spectra[np.argmax(np.sum(heard**2, axis=1))]) * spectra)
+    peaks = np.argmax(similar, axis=1)
+    rows = np.arange(len(peaks))
+    before, at, after = (similar[rows, (peaks + step) % similar.shape[1]] for step in (-1, 0, 1))
+    curvature = before - 2 * at + after
+    fine = np.divide(before - after, 2 * curvature, out=np.zeros_like(at), where=curvature < 0)
+    whole = (peaks + similar.shape[1] // 2) % similar.shape[1] - similar.shape[1] // 2
+    return np.asarray(whole + fine)
+
+
+def _lead(sent: np.ndarray, heard: np.ndarray) -> int:
+    """Return by how many samples a recording comes before the one that should cause it; 0 if it does not."""
+    segment = min(_SPECTRUM, sent.size // 16)
+    n = sent.size // segment * segment
+    x, d = (np.fft.rfft(np.hanning(segment) * one[:n].reshape(-1, segment), 2 * segment) for one in (sent, heard))
+    power = np.mean(np.abs(x) ** 2, axis=0)
+    response = np.fft.irfft(np.mean(np.conj(x) * d, axis=0) / (power + _FLOOR * np.mean(power)))
+    early = response[segment:] ** 2
+    lead = segment - int(np.argmax(early))
+    return lead if np.sum(early) > _LEAST_LEAD * np.sum(response**2) and lead > 1 else 0

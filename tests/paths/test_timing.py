@@ -1,0 +1,84 @@
+"""What two recordings show of their clocks, lost samples and order, where one explains the other badly."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from kfopc_filterpy import Plant
+from kfopc_filterpy.commands import main
+from kfopc_filterpy.paths.timing import timing_fault
+from kfopc_filterpy.power import AmplifierRating
+from kfopc_filterpy.signals import write_wav
+from kfopc_filterpy.verdict import assess
+
+FS, DELAY, N = 8000, 20, 8 * 8000
+RNG = np.random.default_rng(3)
+FREQUENCIES, PHASES = RNG.uniform(50, 3500, 300), RNG.uniform(0, 2 * np.pi, 300)
+
+
+def noise(times):
+    """Return noise that is known between the samples, too."""
+    return np.sum([np.cos(2 * np.pi * f * times + phase) for f, phase in zip(FREQUENCIES, PHASES, strict=True)], axis=0)
+
+
+@pytest.fixture(scope="module")
+def sent():
+    return noise(np.arange(N) / FS)
+
+
+def with_clock(ppm):
+    return 0.5 * noise((np.arange(N) * (1 - 1e-6 * ppm) - DELAY) / FS)
+
+
+@pytest.mark.parametrize("ppm", [-50, 50, 300])
+@pytest.mark.parametrize("snr_db", [None, 20])
+def test_clocks_that_differ_are_told_with_their_ppm(sent, ppm, snr_db):
+    heard = with_clock(ppm)
+    if snr_db is not None:
+        heard += heard.std() * 10 ** (-snr_db / 20) * np.random.default_rng(0).standard_normal(N)
+    fault = timing_fault(sent, heard, FS, ("x", "d"))
+    found = re.search(r"delay of d drifts by (\S+) samples, so the clocks differ by (\S+) ppm", fault)
+    assert float(found[1]) == pytest.approx(ppm * 1e-6 * N, abs=0.3)
+    assert float(found[2]) == pytest.approx(ppm, abs=3)
+
+
+@pytest.mark.parametrize(
+    ("lost", "said"), [(256, "256 samples earlier"), (16, "16 samples earlier"), (-64, "64 samples later")]
+)
+def test_a_lost_block_is_told_with_its_samples_and_its_place(sent, lost, said):
+    heard, at = np.pad(with_clock(0), (0, 300)), 3 * FS
+    heard = np.concatenate([heard[:at], heard[at + lost :]])[:N]
+    fault = timing_fault(sent, heard, FS, ("x", "d"))
+    assert said in fault
+    assert float(re.match(r"from about (\S+) s on, d is", fault)[1]) == pytest.approx(3, abs=1)
+
+
+def test_swapped_files_are_told(sent):
+    assert timing_fault(with_clock(0), sent, FS, ("x", "d")) == "d comes 2.5 ms before x: are the files swapped?"
+
+
+@pytest.mark.parametrize("noise_gain", [0, 0.5, 3])
+def test_recordings_of_one_clock_have_no_fault_however_noisy(sent, noise_gain):
+    heard = with_clock(0) + noise_gain * np.random.default_rng(0).standard_normal(N) * sent.std()
+    assert timing_fault(sent, heard, FS, ("x", "d")) is None
+
+
+def test_identify_refuses_a_path_of_two_clocks_and_names_them(sent, tmp_path, capsys):
+    """The gain of 0.5 would come out as 0.2 or so."""
+    for name, signal in (("sent", sent), ("heard", with_clock(50))):
+        write_wav(tmp_path / f"{name}.wav", signal, FS)
+    names = [str(tmp_path / f"{name}.wav") for name in ("sent", "heard", "S")]
+    assert main(["paths", "identify", *names[:2], "--taps", "64", "-o", names[2]]) == 2
+    assert re.search(r"the clocks differ by \+(49|50|51)\.\d ppm: .* Nothing was written", capsys.readouterr().err)
+    assert not (tmp_path / "S.wav").exists()
+
+
+def test_a_verdict_that_coherence_limits_names_the_clocks_in_place_of_the_microphones_place(sent):
+    plant = Plant(np.eye(16)[8], fs=FS)
+    rating = AmplifierRating(8.0, sine_watt=1e5)
+    verdict = assess(sent, plant, disturbance=with_clock(300), rating=rating, want_db=20, n_taps=64, beside=())
+    assert verdict.limited_by == "coherence"
+    assert re.match(r"The delay of disturbance drifts .* \+(29[89]|30[01])\.\d ppm", verdict.advice[0])
