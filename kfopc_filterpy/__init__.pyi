@@ -53,16 +53,7 @@ from .filters.kfopc import KFOPC as KFOPC
 from .loop.result import SimulationResult as SimulationResult
 from .loop.simulation import simulate as simulate
 from .metrics import (
-    clipped_fraction as clipped_fraction,
-)
-from .metrics import (
-    convergence_time_s as convergence_time_s,
-)
-from .metrics import (
     noise_reduction_db as noise_reduction_db,
-)
-from .metrics import (
-    nse_db as nse_db,
 )
 from .metrics import (
     output_power as output_power,

@@ -212,11 +212,6 @@ def primary_paths(
     return path_matrix(paths, fs=fs, n_taps=n_taps, name=name, axes=PRIMARY_AXES)
 
 
-def single_path(path: PathModels, name: str, fs: float | None = None) -> tuple[np.ndarray, float | None]:
-    """Return one path as taps, (n_taps,), and its sampling rate in Hz if a system tells it."""
-    return path_taps(path, fs=fs, name=name), sampling_rate(path, fs, name=name) if tells_rate(path) else None
-
-
 def feedback_paths(
     paths: PathModels, *, fs: float | None = None, n_taps: int | None = None, name: str = "feedback"
 ) -> tuple[np.ndarray, float | None]:
@@ -226,13 +221,6 @@ def feedback_paths(
         if first != 0.0:
             raise ValueError(f"{name} must have a delay of a sample at least: a first tap is {first:g}, not 0")
     return taps, rate
-
-
-def is_path_matrix(paths: PathModels) -> bool:
-    """Return whether paths are given as a matrix (outputs, inputs, taps), be it one by one, or as a matrix of systems."""
-    if is_system(paths):
-        return (paths.noutputs, paths.ninputs) != (1, 1)
-    return _has_systems(paths) or np.ndim(paths) > 1
 
 
 def path_matrix(

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, __version__, noise_reduction_db, nse_db, output_power
+from kfopc_filterpy import SimulationResult, __version__, noise_reduction_db, output_power
 from kfopc_filterpy._writing import prepare_folder, write_whole
+from kfopc_filterpy.metrics import nse_db
 from kfopc_filterpy.verdict.runs import one_blas_thread
 
 from ..bench import Algorithm, AllDivergedError, Runs, make_controller, run_setting, tune

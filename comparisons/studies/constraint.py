@@ -8,8 +8,8 @@ from itertools import chain, product
 
 import numpy as np
 
-from kfopc_filterpy import convergence_time_s
 from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
+from kfopc_filterpy.metrics import convergence_time_s
 from kfopc_filterpy.plot import curve_style
 
 from .. import bench

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import convergence_time_s, noise_reduction_db, nse_db, output_power
-from kfopc_filterpy.metrics import overshoot, short_time_power
+from kfopc_filterpy import noise_reduction_db, output_power
+from kfopc_filterpy.metrics import convergence_time_s, nse_db, overshoot, short_time_power
 
 from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
 from . import cases

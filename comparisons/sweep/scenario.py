@@ -15,13 +15,11 @@ from kfopc_filterpy import (
     Plant,
     SimulationResult,
     SoftSaturationAmplifier,
-    clipped_fraction,
-    convergence_time_s,
     noise_reduction_db,
     output_power,
 )
 from kfopc_filterpy._validate import as_number
-from kfopc_filterpy.metrics import overshoot
+from kfopc_filterpy.metrics import clipped_fraction, convergence_time_s, overshoot
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot.style import decibels
 from kfopc_filterpy.verdict.runs import AllDivergedError

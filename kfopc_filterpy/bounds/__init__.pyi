@@ -1,4 +1,3 @@
-from .measurement_noise import measurement_noise_from_residual as measurement_noise_from_residual
 from .measurement_noise import measurement_noise_from_run as measurement_noise_from_run
 from .power_constrained import ControlFilter as ControlFilter
 from .power_constrained import ControlFilters as ControlFilters

@@ -1,11 +1,11 @@
-"""Estimates of the measurement noise variance q = E[e_o^2] of eq. 7, from recordings."""
+"""Estimate of the measurement noise variance q = E[e_o^2] of eq. 7, from a recording."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validate import as_count, as_signal
+from .._validate import as_count
 from ..plant import Plant
 from .wiener import full_stretch, loss_db, one_channel, warn_of_loss
 
@@ -71,34 +71,5 @@ def measurement_noise_from_run(
         loss_db(stretch, correlations, weights), "q cannot be told from this run, and the estimate is too high"
     )
     explained = np.convolve(np.convolve(x, s), weights)[: x.size]
-    return measurement_noise_from_residual((d - explained)[transient:], n_fitted=n_taps)
-
-
-def measurement_noise_from_residual(residual: ArrayLike, *, n_fitted: int = 0) -> float:
-    """Estimate the measurement noise variance from the residual of a batch fit.
-
-    Parameters
-    ----------
-    residual : array_like, shape (n_samples,)
-        Part of the disturbance that the fitted control filter leaves.
-    n_fitted : int, default 0
-        Number of weights fitted to these samples; each takes a degree of freedom.
-
-    Returns
-    -------
-    float
-        Estimate of q.
-
-    Raises
-    ------
-    ValueError
-        If the residual is not longer than `n_fitted`, or not finite.
-
-    Examples
-    --------
-    >>> measurement_noise_from_residual([0.5, -0.5, 0.5, -0.5], n_fitted=2)  # 4 squares of 0.25, 2 degrees of freedom
-    0.5
-    """
-    n_fitted = as_count(n_fitted, "n_fitted", minimum=0)
-    e = as_signal(residual, "residual", min_length=n_fitted + 1)
-    return float(e @ e) / (e.size - n_fitted)
+    residual = (d - explained)[transient:]
+    return float(residual @ residual) / (residual.size - n_taps)  # each weight takes a degree of freedom

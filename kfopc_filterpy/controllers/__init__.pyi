@@ -2,7 +2,6 @@ from .base import Controller as Controller
 from .core_controller import CoreController as CoreController
 from .feedback import FeedbackNeutralizer as FeedbackNeutralizer
 from .internal_model import with_internal_model as with_internal_model
-from .leaky import leak_factor as leak_factor
 from .mov import penalty_factor as penalty_factor
 from .processing import RefusedUpdate as RefusedUpdate
 from .virtual import KalmanObserver as KalmanObserver

@@ -216,9 +216,6 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
     # The block.
 
-    def _algorithm(self) -> Algorithm:
-        return Algorithm(self.algorithm)
-
     def _needed_shape(self, path_taps: int, guard_taps: int) -> Shape:
         """Return the shape of a block for the present limiter and constraint."""
         return Shape(

@@ -5,55 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from .._types import PerLoudspeaker
-from .._validate import as_nonnegative
 from ..plant import Secondary
 from ..power.amplifiers import Amplifiers
 from ..power.constraint import Constraints
 from ..power.limiter import Limiters
 from .core_controller import CoreController
 from .making import controller_maker, require_rated_power
-from .mov import penalty_factor
-
-
-def leak_factor(
-    rated_power: float, *, disturbance_power: float, secondary_path_gain: float, reference_power: float
-) -> float:
-    r"""Return the leak of leaky FxLMS for a rated output power, :math:`E[x^2]` times `penalty_factor`.
-
-    The leak penalises :math:`w^T w`, and :math:`E[y^2] = E[x^2] w^T w` for a white reference. For a tone and L taps,
-    the leak that keeps the rated power is L/2 times as high, so this one exceeds the rated power.
-
-    Parameters
-    ----------
-    rated_power, disturbance_power, secondary_path_gain
-        As for `penalty_factor`.
-    reference_power : float
-        Power of the reference.
-
-    Returns
-    -------
-    float
-        Leak gamma, in the unit of the squared reference; 0 if the rated power is enough.
-
-    Raises
-    ------
-    ValueError
-        As for `penalty_factor`; a reference power that is negative or not finite.
-
-    References
-    ----------
-    D. Shi, B. Lam, W.-S. Gan, S. Wen, "Optimal leak factor selection for the output-constrained leaky filtered-input
-    least mean square algorithm", IEEE Signal Processing Letters 26(5), 2019. Derived here from the fixed point
-    :math:`(R_{x'} + \gamma I) w = r` for a white reference.
-
-    Examples
-    --------
-    >>> from kfopc_filterpy.controllers import leak_factor
-    >>> leak_factor(0.25, disturbance_power=4.0, secondary_path_gain=1.0, reference_power=2.0)
-    6.0
-    """
-    gamma = penalty_factor(rated_power, disturbance_power=disturbance_power, secondary_path_gain=secondary_path_gain)
-    return as_nonnegative(reference_power, "reference_power") * gamma
 
 
 @controller_maker
@@ -77,8 +34,7 @@ def leaky_fx_lms(
     n_taps, secondary, step_size, n_references, limiter
         As for `fx_lms`.
     leak : float or array_like, shape (J,)
-        Leak gamma, or that of each loudspeaker, zero or above, in the unit of the squared reference; `leak_factor`
-        computes it for a rated power.
+        Leak gamma, or that of each loudspeaker, zero or above, in the unit of the squared reference.
 
     Returns
     -------
@@ -138,8 +94,9 @@ def optimal_leaky_fx_lms(
 
     .. math:: \gamma(n) = E[x^2] \max\{\sqrt{G_s \delta_d^2 / \rho_o} - G_s,\ 0\}
 
-    The formula is that of `leak_factor`, and the powers are estimated as in KF-OPC. With several loudspeakers, each has
-    its own gamma, from the sums stated in `mov_fx_lms`.
+    The leak penalises :math:`w^T w`, and :math:`E[y^2] = E[x^2] w^T w` for a white reference: for a tone, this leak
+    exceeds the rated power. The powers are estimated as in KF-OPC. With several loudspeakers, each has its own gamma,
+    from the sums stated in `mov_fx_lms`.
 
     Parameters
     ----------
@@ -171,7 +128,9 @@ def optimal_leaky_fx_lms(
 
     References
     ----------
-    As for `leak_factor`, where the powers are known beforehand.
+    D. Shi, B. Lam, W.-S. Gan, S. Wen, "Optimal leak factor selection for the output-constrained leaky filtered-input
+    least mean square algorithm", IEEE Signal Processing Letters 26(5), 2019. Derived here from the fixed point
+    :math:`(R_{x'} + \gamma I) w = r` for a white reference.
 
     Examples
     --------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -231,19 +230,12 @@ class CausalityMargin:
         energy. With several channels the earliest over the references, at each microphone.
     secondary_onset_s : float or numpy.ndarray, shape (K, J)
         Energy onset of the secondary path, or of that from each loudspeaker to each microphone; inf for a silent one.
-    primary_delay_s : float or numpy.ndarray, shape (K,)
-        Group delay of the primary path in s, averaged over the band with the weight ``|H|^2``. In a reverberant path it
-        includes the reverberation, so the onset is the safer measure.
-    secondary_delay_s : float or numpy.ndarray, shape (K, J)
-        The same of the secondary path.
     fs : float
         Sampling rate in Hz.
     """
 
     primary_onset_s: Any
     secondary_onset_s: Any
-    primary_delay_s: Any
-    secondary_delay_s: Any
     fs: float
 
     def __repr__(self) -> str:
@@ -268,27 +260,6 @@ class CausalityMargin:
         """Margin by energy onset in samples."""
         return self.margin_s * self.fs
 
-    @property
-    def deciding_pair(self) -> tuple[int, int]:
-        """Microphone and loudspeaker (k, j), from 0, whose margin is that of the whole."""
-        k = int(np.argmin(self.margins_s.max(axis=1)))
-        return k, int(np.argmax(self.margins_s[k]))
-
-    @property
-    def group_delay_margins_s(self) -> np.ndarray:
-        """Margins by mean group delay in s, shape (K, J), one for each pair; -inf for a silent secondary path."""
-        return np.atleast_1d(self.primary_delay_s)[:, np.newaxis] - np.atleast_2d(self.secondary_delay_s)
-
-    @property
-    def group_delay_margin_s(self) -> float:
-        """Margin by mean group delay in s, of the whole."""
-        return float(self.group_delay_margins_s.max(axis=1).min())
-
-    @property
-    def group_delay_margin_samples(self) -> float:
-        """Margin by mean group delay in samples."""
-        return self.group_delay_margin_s * self.fs
-
 
 def energy_onset(taps: np.ndarray, share: float = 0.01) -> int:
     """Return the sample by which an impulse response has delivered `share` of its energy."""
@@ -299,7 +270,6 @@ def energy_onset(taps: np.ndarray, share: float = 0.01) -> int:
 def causality_margin(
     plant: Plant,
     *,
-    band: tuple[float, float] | None = None,
     onset_share: float = 0.01,
 ) -> CausalityMargin:
     """Return the causality margin, the delay of the primary path over that of the secondary path.
@@ -310,8 +280,6 @@ def causality_margin(
     ----------
     plant : Plant
         Plant with a primary path.
-    band : (float, float), optional
-        Band in Hz over which the group delay is averaged, by default all frequencies.
     onset_share : float, default 0.01
         Share of the energy that marks the onset, above 0 and below 1. The default of 1 % ignores the ringing before a
         band-limited arrival.
@@ -319,7 +287,7 @@ def causality_margin(
     Returns
     -------
     CausalityMargin
-        Onsets, mean group delays and margins: of each pair of a microphone and a loudspeaker if there are several, and
+        Onsets and margins: of each pair of a microphone and a loudspeaker if there are several, and
         of the whole.
 
     Raises
@@ -331,8 +299,8 @@ def causality_margin(
     --------
     >>> from kfopc_filterpy import Plant, bandpass_path
     >>> margin = causality_margin(Plant(bandpass_path(32, fs=16000), bandpass_path(128, fs=16000)))
-    >>> round(margin.margin_samples), round(margin.group_delay_margin_samples)
-    (45, 48)
+    >>> round(margin.margin_samples)
+    45
 
     Two loudspeakers and two microphones, in which sounds arrive after whole samples:
 
@@ -341,8 +309,8 @@ def causality_margin(
     >>> margin.margins_s * margin.fs
     array([[7., 2.],
            [4., 5.]])
-    >>> margin, margin.deciding_pair
-    (<CausalityMargin of 2 microphone(s) and 2 loudspeaker(s): 0.625 ms, 5 samples>, (1, 1))
+    >>> margin
+    <CausalityMargin of 2 microphone(s) and 2 loudspeaker(s): 0.625 ms, 5 samples>
     """
     share = as_positive(onset_share, "onset_share")
     if share >= 1:
@@ -351,27 +319,13 @@ def causality_margin(
     if plant.primary is None:
         raise ValueError("plant must have a primary path: make it with Plant(secondary, primary)")
     p, s, fs = plant.primary, plant.secondary, plant.fs
-    low, high = (0.0, fs / 2) if band is None else as_band(band, fs)
     require_sound("primary", p)
     require_sound("secondary", s)
 
-    def of_each(paths: np.ndarray, measure: Callable[[np.ndarray], float]) -> np.ndarray:
-        return np.array([[measure(h) if np.any(h) else np.inf for h in row] for row in paths])
+    def onsets(paths: np.ndarray) -> np.ndarray:
+        return np.array([[energy_onset(h, share) / fs if np.any(h) else np.inf for h in row] for row in paths])
 
-    onsets = [of_each(paths, lambda h: energy_onset(h, share) / fs) for paths in (p, s)]
-    delays = [of_each(paths, lambda h: _mean_group_delay(h, low, high, fs)) for paths in (p, s)]
-    found: list[Any] = [onsets[0].min(axis=1), onsets[1], delays[0].min(axis=1), delays[1]]
-    onset_p, onset_s, delay_p, delay_s = (one.item() for one in found) if has_one_channel(plant, p[0]) else found
-    return CausalityMargin(onset_p, onset_s, delay_p, delay_s, fs)
-
-
-def _mean_group_delay(taps: np.ndarray, low: float, high: float, fs: float) -> float:
-    """Return the group delay weighted by |H|²: mean of Re(conj(H) FT{n h}) over mean of |H|² in the band, in s."""
-    from scipy.signal import zoom_fft
-
-    n = 4 * taps.size
-    half = (high - low) / (2 * n)
-    between = [low + half, high + half]  # the middles of n parts of the band; the second edge itself is left out
-    response = zoom_fft(taps, between, n, fs=fs)
-    ramped = zoom_fft(taps * np.arange(taps.size), between, n, fs=fs)  # transform of n h[n]
-    return float(np.sum(np.real(np.conj(response) * ramped)) / np.sum(np.abs(response) ** 2) / fs)
+    primary_onset, secondary_onset = onsets(p).min(axis=1), onsets(s)
+    if has_one_channel(plant, p[0]):
+        return CausalityMargin(primary_onset.item(), secondary_onset.item(), fs)
+    return CausalityMargin(primary_onset, secondary_onset, fs)

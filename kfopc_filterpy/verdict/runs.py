@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from kfopc_filterpy import Plant, SimulationResult, nse_db, simulate
+from kfopc_filterpy import Plant, SimulationResult, simulate
 from kfopc_filterpy.bounds import SuggestedSettings
 from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.controllers.table import CORE
+from kfopc_filterpy.metrics import nse_db
 
 from .._types import ProgressBar
 from .candidates import CANDIDATES, Known, Settings, filtered_power

@@ -12,8 +12,8 @@ from comparisons.studies import cases, tracking
 from comparisons.studies import tracking_events as events
 from comparisons.studies.tracking import TrackingRow
 from comparisons.studies.tracking_events import CHIRP_HZ, SWEEP_S, change_scene, sweep
-from kfopc_filterpy import Plant, convergence_time_s, noise_reduction_db
-from kfopc_filterpy.metrics import overshoot
+from kfopc_filterpy import Plant, noise_reduction_db
+from kfopc_filterpy.metrics import convergence_time_s, overshoot
 
 FS = 16000.0
 TAPS = 16

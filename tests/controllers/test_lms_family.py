@@ -27,7 +27,7 @@ from kfopc_filterpy import (
     simulate,
     two_gradient_fx_lms,
 )
-from kfopc_filterpy.controllers import leak_factor, penalty_factor
+from kfopc_filterpy.controllers import penalty_factor
 
 L = 5
 PATH = np.array([0.0, 0.8, -0.3, 0.1])  # true secondary path
@@ -120,10 +120,9 @@ def test_a_white_reference_through_a_flat_path_is_held_to_the_rated_power(kind: 
     assert made.weights[1] == pytest.approx(2.0, rel=0.03)  # half of 4
 
 
-def test_penalty_and_leak_by_hand() -> None:
+def test_penalty_by_hand() -> None:
     assert penalty_factor(1.0, disturbance_power=4.0, secondary_path_gain=0.25) == pytest.approx(1.0 - 0.25, rel=1e-15)
     assert penalty_factor(20.0, disturbance_power=4.0, secondary_path_gain=0.25) == 0.0  # 16 would do
-    assert leak_factor(1.0, disturbance_power=4.0, secondary_path_gain=0.25, reference_power=3.0) == pytest.approx(2.25)
 
 
 @given(st.floats(1e-6, 1e6), st.floats(1e-6, 1e6), st.floats(1e-6, 1e6))

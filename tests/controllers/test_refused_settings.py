@@ -29,7 +29,7 @@ from kfopc_filterpy import (
     rescaling_fx_lms,
     two_gradient_fx_lms,
 )
-from kfopc_filterpy.controllers import leak_factor, penalty_factor
+from kfopc_filterpy.controllers import penalty_factor
 
 L = 6
 PATH, PATHS = np.array([0.0, 0.8, -0.3]), random_paths(3, 2, 4, seed=1)
@@ -98,7 +98,6 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: fx_lms(L, PATHS, n_references=0, **STEP), "n_references must be at least 1"),
     (lambda: fx_lms(L, PATHS, limiter=[OutputLimiter(1.0, fs=8000)] * 2, **STEP), "2 different OutputLimiters"),
     (lambda: penalty_factor(1.0, **POWERS | {"disturbance_power": np.nan}), "disturbance_power"),
-    (lambda: leak_factor(1.0, **POWERS, reference_power=-1.0), "reference_power"),
 ]
 # fmt: on
 

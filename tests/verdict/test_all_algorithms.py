@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kfopc_filterpy import Plant, fx_lms, fx_nlms, noise_reduction_db, nse_db, simulate
+from kfopc_filterpy import Plant, fx_lms, fx_nlms, noise_reduction_db, simulate
 from kfopc_filterpy.controllers.table import CORE
+from kfopc_filterpy.metrics import nse_db
 from kfopc_filterpy.signals import band_limited_noise
 from kfopc_filterpy.verdict import assess
 from kfopc_filterpy.verdict.candidates import CANDIDATES, ONE_CHANNEL
