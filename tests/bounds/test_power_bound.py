@@ -230,6 +230,16 @@ def test_band_limited_noise_of_numerical_rank_far_below_its_taps():
         assert best * (1 - 1e-6) <= part.error_power <= best * (1 + 1e-3)
 
 
+def test_what_is_cancelled_wholly_is_300_db():
+    x = np.resize([1.0, -1.0, -1.0], 1000)  # powers of two: the error is zero, not rounding
+    found = power_constrained_wiener(x, Plant([1.0], fs=FS), n_taps=1, rated_power=1.0, disturbance=0.5 * x)
+    assert found.whole.error_power == 0
+    assert not found.whole.weights.flags.writeable
+    assert not found.disturbance.flags.writeable
+    assert found.whole.noise_reduction_db == found.per_second.noise_reduction_db == 300
+    assert found.noise_reduction_over(1.0)["per_second"] == 300
+
+
 def test_ridge_is_that_of_a_kalman_filter_without_state_noise():
     x, d, plant = scene(600)
     n_taps, q, variance, on = 6, 0.04, 0.02, 130

@@ -177,6 +177,16 @@ def test_a_plant_that_is_not_causal_is_refused_with_the_way_out() -> None:
     assert np.isnan(report.possible_db)  # 400 samples of silence are too few to tell
 
 
+def test_simulated_noise_may_repeat_itself_from_block_to_block() -> None:
+    periodic = np.tile(np.random.default_rng(2).standard_normal(32), 500)
+    interface = SimulatedInterface(periodic, Plant(S, PRIMARY, fs=FS), block=32, latency=64)
+    silent = fx_lms(
+        8, interface.total_plant.secondary[0, 0], step_size=1e-12
+    )  # so that the errors repeat themselves too
+    report = run(silent, interface, amplitude_limit=1.0, seconds=1.0, listen_s=0.1, check_causality=False)
+    assert not report.health.counts
+
+
 def test_a_loudspeaker_that_is_not_heard_is_a_fault() -> None:
     with pytest.raises(FaultError, match="no loudspeaker is heard by any error microphone"):
         started(SimulatedInterface(X, Plant([0.0, 0.0], PRIMARY, fs=FS), block=32, latency=64))
