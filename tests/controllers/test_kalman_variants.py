@@ -9,7 +9,6 @@ import pytest
 from scipy.linalg import toeplitz
 
 from kfopc_filterpy import Plant, diagonal_kf, fx_nlms, fx_rls, kf_anc, simulate
-from kfopc_filterpy.signals import band_limited_noise, tone
 
 L = 6
 FS, PATH = 16000, np.array([0.0, 0.8, -0.3])
@@ -76,37 +75,16 @@ def test_a_diagonal_step_that_would_be_too_large_is_left_out() -> None:
     assert controller.weights[0] == pytest.approx(1e40)
 
 
-# Forgetting, and a normalised step, where little is excited.
+# Defaults
 
 RATE = 8000
 ROOM = np.array([0.0, 0.0, 0.0, 0.8, 0.0, -0.2])
 PRIMARY = np.zeros(40)
 PRIMARY[[8, 12, 20]] = 1.0, 0.5, -0.3
-NOISES: dict[str, Any] = {
-    "white": lambda n: 0.3 * np.random.default_rng(0).standard_normal(n),
-    "band": lambda n: band_limited_noise((200.0, 600.0), n / RATE, fs=RATE, power=0.09, rng=1),
-    "tone": lambda n: tone(300.0, n / RATE, fs=RATE, amplitude=0.4),
-}
 MAKERS: dict[str, Any] = {
     "FxRLS": lambda: fx_rls(32, ROOM, forgetting=0.999),
     "FxNLMS": lambda: fx_nlms(32, ROOM, step_size=0.1),
 }
-
-
-@pytest.mark.parametrize("noise", NOISES)
-def test_a_silent_start_makes_nothing_loud(noise: str) -> None:
-    """60 memories of digital silence, in which forgetting alone would raise P by 1e26; then sensor noise comes in, too.
-
-    With P at 1e12 of its start, y peaked at 80 times what it is without the silence; at 1e20, the weights were NaN.
-    """
-    n, silent = 2 * RATE, np.zeros(60_000)
-    peaks = []
-    for start in (silent, silent[:0]):
-        x = np.r_[start, NOISES[noise](n)]
-        result = simulate(MAKERS["FxRLS"](), x, Plant(ROOM, PRIMARY, fs=RATE, sensor_noise_std=1e-3), rng=3)
-        peaks.append(np.max(np.abs(result.control_signal[-n:])))
-        assert np.mean(result.error[-RATE:] ** 2) < 1e-3 * np.mean(result.disturbance[-RATE:] ** 2)
-    assert peaks[0] < 1.3 * peaks[1]
 
 
 @pytest.mark.parametrize(
@@ -114,6 +92,6 @@ def test_a_silent_start_makes_nothing_loud(noise: str) -> None:
 )
 def test_defaults_scale_with_the_signal(name: str, scale: float) -> None:
     """FxRLS begins with the variance of a unit signal: for 1e-5, P has to grow by up to 1e6."""
-    x = scale * NOISES["white"](6 * RATE)
+    x = scale * 0.3 * np.random.default_rng(0).standard_normal(6 * RATE)
     result = simulate(MAKERS[name](), x, Plant(ROOM, PRIMARY, fs=RATE))
     assert np.mean(result.error[-RATE // 2 :] ** 2) < 1e-3 * np.mean(result.disturbance[-RATE // 2 :] ** 2)
