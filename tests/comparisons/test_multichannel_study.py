@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -33,27 +32,6 @@ def small() -> Any:
     constants = {"places": lambda: {"2 x 2": place}, "DURATION_S": 2.0, "SHOWN": ("2 x 2", "band noise")}
     with few_settings(several_channels=KEPT), smaller(multichannel, **constants), smaller(rooms, MAP_SPACING_M=1.0):
         return run_study(multichannel), place
-
-
-def test_the_room_has_every_reflection_at_its_time() -> None:
-    """Against Allen and Berkley's sum over images, with the absorption of all walls by Sabine's formula."""
-    room, size = rooms.built_in_room(2), np.array(rooms.SIZE_M)
-    surface = 2 * np.sum(np.prod(size) / size)
-    absorption = 24 * np.log(10) * np.prod(size) / (rooms.SPEED_OF_SOUND * surface * rooms.REVERBERATION_S)
-    t = np.arange(rooms.N_PATH_TAPS)  # 22 m: within 5 pairs of reflections along the height of 2.6 m
-    plant: Any = room.plant
-    for emitter, found in ((room.sources_m[0], plant.primary[:, 0]), (room.loudspeakers_m[1], plant.secondary[:, 1])):
-        expected = np.zeros_like(found)
-        for pairs in itertools.product(range(-5, 6), repeat=3):
-            for mirrored in itertools.product((0, 1), repeat=3):
-                image = (1 - 2 * np.array(mirrored)) * emitter + 2 * np.array(pairs) * size
-                order = np.sum(np.abs(np.subtract(pairs, mirrored)) + np.abs(pairs))
-                r = np.linalg.norm(image - room.microphones_m, axis=1)[:, np.newaxis]
-                late = t - r / rooms.SPEED_OF_SOUND * rooms.FS
-                pulse = np.sinc(late) * np.cos(np.pi * late / 20) ** 2 * (np.abs(late) < 10)
-                expected += (1 - absorption) ** (order / 2) / (4 * np.pi * r) * pulse
-        # pyroomacoustics holds positions and gains in single precision.
-        np.testing.assert_allclose(found, expected, atol=3e-5 * np.abs(expected).max())
 
 
 def test_rows_are_what_a_run_by_hand_gives(small: Any) -> None:

@@ -58,16 +58,6 @@ def test_each_seed_has_its_own_sensor_noise_apart_from_the_noises():
     assert np.abs(together - np.eye(6)).max() < 0.06  # 5400 samples: 4 standard errors of an independent pair
 
 
-def test_runs_together_hear_the_sensor_noise_of_their_seed():
-    scene = scene_of(8, seeds=(3, 4))
-    for k in range(2):
-        alone = scene.run(make_controller(scene, "KF-ANC", 1e-6), k)
-        (together,) = scene.run_together([make_controller(scene, "KF-ANC", 1e-6)], k)
-        np.testing.assert_allclose(together.error, alone.error, atol=1e-9)
-    assert len(set(scene.sensor_noise_seeds)) == 2
-    assert not set(scene.sensor_noise_seeds) & set(scene.seeds)
-
-
 # ---- Several channels
 
 

@@ -143,15 +143,6 @@ def test_a_cluster_gives_the_rows_of_this_machine_and_goes_on_when_workers_die(t
     assert rows[2]["error"].startswith("KilledWorker: ")
 
 
-def test_a_scheduler_that_is_not_there_is_refused(tmp_path):
-    pytest.importorskip("distributed", reason="Dask's distributed is not installed")
-    with (
-        smaller(study, CONNECT_S=1.0),
-        pytest.raises(OSError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"),
-    ):
-        run_sweep(plane, AXES, tmp_path / "rows", scheduler="tcp://127.0.0.1:9")
-
-
 # The built-in scenario.
 
 

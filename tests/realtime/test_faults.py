@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import numpy as np
@@ -90,15 +91,18 @@ def test_a_repeated_block() -> None:
     assert not is_repeated(np.zeros((1, 64)), np.zeros((1, 64)))  # silence tells nothing
 
 
-def test_the_record_stays_small_and_counts_go_on() -> None:
+def test_the_record_stays_small_and_counts_go_on_whatever_an_exception_says() -> None:
     health = Health()
     for n in range(5000):
         health.note("clipped", "error 0", time_s=float(n), n_samples=2, until_s=n + 0.01)
     assert len(health.events) == 1000
     assert (health.counts["clipped"], health.samples["clipped"]) == (5000, 10000)
     health.note("clipped", "error 1", time_s=4999.005, until_s=4999.1)
-    assert health.counts["clipped"] == 5001  # another channel
-    assert repr(health) == "<Health: 5001 clipped>"
+    assert repr(health) == "<Health: 5001 clipped>"  # another channel
+    for n in range(500):
+        health.note(f"diverged: {n} {'x' * 10_000}", f"loudspeaker {n}", time_s=5000.0 + n)
+    assert len(pickle.dumps(health)) < 500_000  # 1000 events of up to 200 letters
+    assert health.counts["other"] == 401  # a hundred kinds are told apart, "clipped" among them
 
 
 def test_the_record_joins_events_that_are_close_and_keeps_others_apart() -> None:
