@@ -3,9 +3,9 @@
 
 /* Of the windows: positions in them are reals, and a float counts no further. */
 #ifdef ANC_FLOAT
-enum { LONGEST = 1 << 24 };
+static const double LONGEST = 1 << 24;
 #else
-enum { LONGEST = 1 << 28 };
+static const double LONGEST = 1 << 28;
 #endif
 
 static int in_range(const anc_setting *setting, real value)
@@ -28,7 +28,7 @@ static int shape_accepted(const anc_plan *p)
                              p->references, p->taps,        p->path_taps};
     const double most = 1 << 28, G = ANC_GUARD_TAPS, S = p->scenarios;
     const double K = p->microphones, J = p->loudspeakers, I = p->references;
-    const double L = p->taps, M = p->path_taps;
+    const double L = p->taps, M = p->path_taps, kinds = ANC_POWERS;
     for (int i = 0; i < 6; i++)
         if (shape[i] < 1 || shape[i] > most) return 0;
     if (p->modelled && (S != 1 || I < K)) return 0;
@@ -37,7 +37,7 @@ static int shape_accepted(const anc_plan *p)
     for (int32_t sj = 0; sj < p->scenarios * p->loudspeakers; sj++) {
         const double powers = p->power_windows ? p->power_windows[sj] : 0;
         const double limiter = p->limiter_windows ? p->limiter_windows[sj] : 1;
-        if (!(powers >= 0 && powers <= LONGEST && S * J * powers * ANC_POWERS <= most)) return 0;
+        if (!(powers >= 0 && powers <= LONGEST && S * J * kinds * powers <= most)) return 0;
         if (!(limiter >= 1 && limiter <= LONGEST && S * J * limiter * 3 <= most)) return 0;
     }
     return K * J * I * (4 * L + 4 * G + 64) <= most &&

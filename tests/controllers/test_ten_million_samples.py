@@ -91,10 +91,10 @@ def lms(make, **settings):
 
 
 def limited():
-    return kalman(kf_opc, 1e12, rated_power=RATED_POWER, limiter=OutputLimiter(RATED_POWER, fs=FS))()
+    return kalman(kf_opc, 1e12, **RATED, limiter=OutputLimiter(**RATED))()
 
 
-RATED, LIMIT = {"rated_power": RATED_POWER}, {"amplitude_limit": 1.0}
+RATED, LIMIT = {"rated_power": RATED_POWER, "fs": FS}, {"amplitude_limit": 1.0}
 CASES = {
     "KF-ANC, P0/q = 1e4": kalman(kf_anc, 1e4),
     "KF-ANC, P0/q = 1e12": kalman(kf_anc, 1e12),
