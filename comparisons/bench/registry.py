@@ -21,8 +21,7 @@ from ..rivals import PowerLimitedFxLMS
 from .scene import Scene
 
 # r E[x'^2] / q: the filter forgets over about its inverse square root in samples, 0.6 s to 6 ms at 16 kHz. Less state
-# noise makes it recursive least squares that never forgets, which would always be best for stationary noise; the tonal
-# study shows the difference.
+# noise makes it recursive least squares that never forgets, which would always be best for stationary noise.
 STATE_NOISE_GRID = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer grid around the best value follows
 BLOCK_STEP_GRID = (0.02, 0.05, 0.1, 0.2, 0.4)  # divided by the power in each bin, so it needs no units

@@ -51,18 +51,15 @@ def main(runs: Runs) -> StudyReport | str:
         once = {name: grid for name, grid in _grids() if not REGISTRY[name].sees_budget}
         trials = bench.try_settings(runs, scene, once)
         tuned = {multiple: bench.tune(runs, at, list(WAYS), trials=trials) for multiple, at in scenes.items()}
+        settings = {f"{100 / multiple:g} %": parts.tuned_in_words(own) for multiple, own in tuned.items()}
     return StudyReport(
         name="ways",
         title="Ten ways to keep a rated power",
         summary="The first author's compressor and duct; each way at its best setting for each rated power.",
         fs=scene.fs,
         rated_power=scene.rated_power,
-        parameters={
-            f"{100 / multiple:g} %": Parameter(parts.tuned_in_words(own), f"best and tried; {Tuned.RULE}")
-            for multiple, own in tuned.items()
-        },
+        parameters={name: Parameter(own, f"best and tried; {Tuned.RULE}") for name, own in settings.items()},
         tables=[_table(scenes, tuned)],
-        notes=[note for own in tuned.values() for note in parts.tuning_note(own)],
     )
 
 

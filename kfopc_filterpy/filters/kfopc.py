@@ -115,7 +115,7 @@ class KFOPC(KalmanFilter, Checkpointed):
     References
     ----------
     J. Ji, D. Shi, B. Wang, X. Shen, Z. Luo, W.-S. Gan, "Preventing output saturation in active noise control:
-    An output-constrained Kalman filter approach", eq. 1-13.
+    An output-constrained Kalman filter approach", ICASSP 2025, pp. 1-5, eq. 1-13.
 
     Examples
     --------

@@ -17,7 +17,10 @@ from oracles.powers import Constraint
 from comparisons.bench.measured import load_measured_duct
 from comparisons.rivals import ImprovedMOV
 from comparisons.rivals.improved_mov import FLOOR, WINDOW
+from comparisons.studies import duct, tonal
+from comparisons.studies.cases import AUTHORS
 from kfopc_filterpy import HardClipAmplifier, OutputPowerConstraint, Plant, mov_fx_lms, noise_reduction_db, simulate
+from kfopc_filterpy.signals import tone
 
 CASES = ("duct", "broadband", "tone")
 
@@ -100,3 +103,22 @@ def test_mov_mfxlms_is_the_authors_but_for_the_powers(case: Case) -> None:
     result = case.run(mov_fx_lms(case.L, case.secondary, step_size=case.mu, constraint=constraint, modified=True))
     theirs = noise_reduction_db(case.of("mov_mfxlms/error"), case.d)
     assert noise_reduction_db(result.error, case.d) == pytest.approx(theirs, abs=0.002)
+
+
+def test_the_studies_have_the_authors_settings(shared_data: Path) -> None:
+    """Their band-pass paths bit for bit, their window, their tone to 1 %, and their compressor of unit variance."""
+    runs = np.load(shared_data / "author_code" / "runs.npz")
+    plant = AUTHORS.plant()
+    np.testing.assert_array_equal(plant.primary[0, 0], runs["broadband/primary"])
+    np.testing.assert_array_equal(plant.secondary[0, 0], runs["broadband/secondary"])
+    assert (AUTHORS.n_taps, AUTHORS.memory_s * 16000, AUTHORS.window) == (256, WINDOW, "sliding")
+    sine = tone(400.0, 1.5, fs=16000)
+    scene = AUTHORS.scene({0: sine}, plant, rated_power=tonal.RATED_POWER, power_multiple=tonal.POWER_MULTIPLE)
+    assert np.max(scene.references[0]) == pytest.approx(np.max(runs["tone/reference"]), rel=0.01)
+    assert np.sqrt(2.0) == tonal.LIMIT
+    noise = np.random.default_rng(0).standard_normal(16000)
+    short = Plant([1.0], [0.0, 1.0], fs=16000)
+    scene = duct.scene_of(noise, short, as_authors=True)
+    assert np.var(scene.references[0]) == pytest.approx(1.0)
+    assert scene.power_window == "sliding"
+    assert scene.unconstrained_power == pytest.approx(1.0, rel=0.02)  # white noise through a delay
