@@ -73,7 +73,7 @@ def _improved() -> dict[str, Algorithm]:
     def settings(scene: Scene, mu: float, _: float) -> dict[str, Any]:
         return {"step_size": mu, "rated_power": scene.rated_power, "primary": [0.0] * N_PRIMARY}
 
-    steps = REGISTRY["MOV-FxLMS"].first
+    steps = REGISTRY["MOV-FxLMS"].first[::2]  # a run in Python takes ten times as long
     return {IMPROVED: Algorithm(ImprovedMOV, settings, "mu", "mu L E[x'^2]", steps, in_core=False)}
 
 
