@@ -228,7 +228,7 @@ WORDS = [
     *("noise.wav", "P.wav", "S.wav", "d.wav", "empty.wav", "text.wav", "zeros.wav"),
     *("nan.npy", "stereo.wav", "tiny.csv"),
     *("missing.wav", ".", "/dev/null", "", "é\u0000"[:1], "out.wav", "no/folder/out.wav", "out.xyz", "--", "-o"),
-    *("--primary", "--secondary", "--disturbance", "--fs", "--channel", "--variable", "--taps", "--memory", "--watt"),
+    *("--primary", "--secondary", "--disturbance", "--fs", "--taps", "--memory", "--watt"),
     *("--ohm", "--rated-power", "--want-db", "--volts-per-unit", "--peak-volts", "--json", "--algorithm", "--seconds"),
     *("0", "-1", "1", "1e-300", "1e300", "1e400", "nan", "inf", "-inf", "8000", "8000.5", "0.1", "abc", "10" * 30),
     *("KF-PB", "FxLMS", "KF-OPC,FxLMS", "--path-error-samples", "--no-such-option"),
@@ -237,7 +237,7 @@ WORDS = [
 SCENE = ["noise.wav", "--primary", "P.wav", "--secondary", "S.wav", "--rated-power", "0.1"]
 COMMANDS = [
     ["paths", "inspect", "S.wav", "--primary", "P.wav", "--fs", "8000"],
-    ["paths", "convert", "S.wav", "-o", "S2.csv", "--channel", "0"],
+    ["paths", "convert", "S.wav:0", "-o", "S2.csv"],
     ["paths", "convert", "S.wav", "-o", "S3.wav", "--fs", "4000"],
     ["paths", "identify", "noise.wav", "d.wav", "--taps", "16", "-o", "S4.wav"],
     ["verdict", *SCENE, "--ohm", "8", "--want-db", "nan"],

@@ -62,7 +62,7 @@ def demo(options: argparse.Namespace) -> int:
     for path, signal in files.items():
         write_wav(path, signal, FS)
     write_whole(settings, SETTINGS)
-    as_stated = argparse.Namespace(fs=None, file_fs=None, channel=None, variable=None)
+    as_stated = argparse.Namespace(fs=None, file_fs=None)
     controller, _ = described(settings, as_stated)
     learned = slice(0, int(5 * FS))
     simulate(controller, signals["noise"][learned], Plant(signals["S"], fs=FS), disturbance=signals["d"][learned])

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import sys
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,7 +19,6 @@ if TYPE_CHECKING:
     from ..plant import Plant
     from ..signals import Recording
 
-STANDARD_INPUT = "-"
 LONG_PATH_S = 5.0  # hardly any impulse response is longer
 LONGEST_PATH_S, MOST_TAPS = 10.0, 65536  # of an impulse response
 
@@ -39,7 +35,7 @@ def _named(argument: str) -> _Named:
     """Return what is named by "x.wav", "x.wav:1", "x.mat:S" or "x.mat:S:1"."""
     parts: dict[str, Any] = {}
     file = argument
-    while file != STANDARD_INPUT and not Path(file).exists():
+    while not Path(file).exists():
         file, colon, part = file.rpartition(":")
         kind = "channel" if part.isdecimal() else "variable"
         if not colon or kind in parts:
@@ -76,8 +72,7 @@ class Files:
 
     def calibrator(self, path: str) -> Recording:
         """Return the recording of a calibrator, at any rate."""
-        with _file(path) as source:
-            return self._chosen(path, source, False, None)
+        return self._chosen(path, False, None)
 
     def channels(self, path: str) -> np.ndarray:
         """Return all channels of a recording, (n_channels, n_samples), none of them silent."""
@@ -124,10 +119,9 @@ class Files:
         """Read a file, whose rate must be that of the files before it."""
         from ..signals.quality import clipping_remarks
 
-        with _file(path) as source:
-            read = self._chosen(path, source, is_path, self.options.fs)
-            if not is_path and read.file_fs not in (None, read.fs):  # resampling would hide clipping
-                self.remarks += clipping_remarks(self._chosen(path, source, is_path, None).samples, path)
+        read = self._chosen(path, is_path, self.options.fs)
+        if not is_path and read.file_fs not in (None, read.fs):  # resampling would hide clipping
+            self.remarks += clipping_remarks(self._chosen(path, is_path, None).samples, path)
         if is_path and read.samples.shape[-1] > LONG_PATH_S * read.fs:
             seconds = read.samples.shape[-1] / read.fs
             warn(self.options, f"{path} lasts {seconds:.3g} s, too long for an impulse response: is it a recording?")
@@ -142,14 +136,14 @@ class Files:
         self.read.append(f"{path}, {' x '.join(map(str, read.samples.shape))} {what} at {read.fs:g} Hz{rate}")
         return read
 
-    def _chosen(self, path: str, source: str, is_path: bool, fs: float | None) -> Recording:
-        """Return the channels of a file, chosen by its argument or else by the options, at a rate."""
+    def _chosen(self, path: str, is_path: bool, fs: float | None) -> Recording:
+        """Return the channels of a file that its argument names, at a rate."""
         from ..paths.reading import path_of
         from ..signals.content import LEAST_SURE_RATE
         from ..signals.recordings import as_channel, read_content, recording_of
 
         named = _named(path)
-        content, file_fs = read_content(source, variable=named.variable or self.options.variable), None
+        content, file_fs = read_content(named.file, variable=named.variable), None
         if content.fs is None or content.fs < LEAST_SURE_RATE:
             file_fs, self._without_rate = self.options.file_fs, True
             if file_fs is None and content.fs is None:
@@ -157,30 +151,12 @@ class Files:
                     f"{path} states no sampling rate: give the rate in Hz at which it was sampled, for example with "
                     "--file-fs 48000 (--fs is the rate to which files are resampled)"
                 )
-        read = (path_of if is_path else recording_of)(source, content, fs, file_fs)
-        channel, called, samples = named.channel, f"the channel in {path}", read.samples
-        if channel is None and samples.ndim > 1:
-            channel, called = self.options.channel, "--channel"
-        if channel is not None:
+        read = (path_of if is_path else recording_of)(named.file, content, fs, file_fs)
+        samples = read.samples
+        if named.channel is not None:
             samples = np.atleast_2d(samples)
-            samples = samples[as_channel(channel, samples, path, called=called)]
+            samples = samples[as_channel(named.channel, samples, path, called=f"the channel in {path}")]
         return replace(read, samples=samples, name=path)
-
-
-@contextmanager
-def _file(path: str) -> Iterator[str]:
-    """Yield the name of the file that an argument names, or for "-" the name of a copy of the standard input."""
-    file = _named(path).file
-    if file != STANDARD_INPUT:
-        yield file
-        return
-    content = sys.stdin.buffer.read()
-    if not content:
-        raise ValueError("standard input is empty: pipe a file into the command")
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "standard-input"
-        copy.write_bytes(content)
-        yield str(copy)
 
 
 def scene_of(options: argparse.Namespace, files: Files) -> tuple[np.ndarray, Plant, np.ndarray | None]:

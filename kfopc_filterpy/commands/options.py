@@ -78,10 +78,6 @@ def add_reading(
     """Add the options for reading files."""
     add_number(parser, "--fs", "Hz", help=about_fs, **of_fs)
     add_number(parser, "--file-fs", "Hz", help="rate of the files that state none")
-    about = "channel to read from files with several, counted from 0; for one file, name it as in FILE:0"
-    add_count(parser, "--channel", 0, help=about)
-    about = "variable to read from files with several; for one file, name it as in FILE:NAME"
-    parser.add_argument("--variable", metavar="NAME", help=about)
 
 
 def add_scene(parser: argparse._ActionsContainer, *, required: bool) -> None:
@@ -100,7 +96,7 @@ def add_scene(parser: argparse._ActionsContainer, *, required: bool) -> None:
 
 def add_recorded_scene(parser: argparse._ActionsContainer) -> None:
     """Add the options for a recorded noise, the paths and the rating."""
-    about = "recording of the reference microphone, made while the loudspeaker is silent; - is standard input"
+    about = "recording of the reference microphone, made while the loudspeaker is silent; FILE:1 is its channel 1, FILE:NAME its variable NAME"
     parser.add_argument("noise", help=about)
     add_scene(parser, required=True)
     rating = parser.add_argument_group(

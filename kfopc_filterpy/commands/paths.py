@@ -32,21 +32,23 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
 
     about = "fit an impulse response to a recorded excitation, noise or sweep"
     own = add("identify", identify, about, "sent.wav received.wav --taps 512 -o S.wav")
-    own.add_argument("excitation", help="what was sent to the amplifier; - is standard input")
+    own.add_argument(
+        "excitation", help="what was sent to the amplifier; FILE:1 is channel 1 of a file, FILE:NAME its variable NAME"
+    )
     own.add_argument("response", help="what the microphone heard, recorded at the same time")
     add_count(own, "--taps", required=True, help="length of the impulse response")
     own.add_argument("-o", "--output", metavar="FILE", required=True, help=f"file to write: {', '.join(WRITTEN)}")
     own.add_argument("--json", action="store_true", help="print JSON")
     add_reading(own)
     own = add("inspect", inspect, "describe an impulse response", "S.wav --primary P.wav")
-    own.add_argument("path", help="the impulse response; - is standard input")
+    own.add_argument("path", help="the impulse response")
     about = "impulse response of the primary path, for the causality margin"
     own.add_argument("--primary", metavar="FILE", help=about)
     own.add_argument("--json", action="store_true", help="print JSON")
     add_reading(own)
     about = "write an impulse response in another format, or at another sample rate"
     own = add("convert", convert, about, "S.wav -o S16.csv --fs 16000")
-    own.add_argument("path", help="the impulse response; - is standard input")
+    own.add_argument("path", help="the impulse response")
     own.add_argument("-o", "--output", metavar="FILE", required=True, help=f"file to write: {', '.join(WRITTEN)}")
     add_reading(own)
 

@@ -106,7 +106,7 @@ def _sound_card(options: argparse.Namespace) -> Interface:
             "a recording with --primary and --secondary is needed for a simulated plant, or --references and --errors, "
             "the inputs of a sound card; without a reference microphone, --feedback in place of --references"
         )
-    of_files = ("primary", "disturbance", "secondary", "microphones", "file_fs", "channel", "variable")
+    of_files = ("primary", "disturbance", "secondary", "microphones", "file_fs")
     refuse_unused(options, of_files, " with a sound card: leave it out, or give a recording")
     if options.fs is None:
         raise ValueError("the sample rate of the sound card is missing: give one that it has, for example --fs 48000")

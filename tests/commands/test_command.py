@@ -66,18 +66,18 @@ ERRORS = {
     "paths convert untimed.npy -o x.wav --fs 8000": "for example with --file-fs 48000",
     # Channels.
     "verdict stereo.wav PATHS --rated-power 1": "choose a channel, as in stereo.wav:0",
-    "verdict stereo.wav PATHS --rated-power 1 --channel 2": "verdict: --channel must be below the 2",
+    "verdict stereo.wav:2 PATHS --rated-power 1": "the channel in stereo.wav:2 must be below the 2",
     "verdict noise.wav --secondary S.wav --rated-power 1 --disturbance stereo.wav:1": "is channel 0 of noise.wav",
     "verdict stereo.wav --secondary S.wav --rated-power 1 --disturbance ./stereo.wav:1": "is channel 0 of stereo.wav",
     "paths convert stereo.wav -o x.npy": "name one of stereo.wav:0 to stereo.wav:1",
     "paths convert S.wav:1 -o x.npy": "the channel in S.wav:1 must be below the 1 channel(s) of S.wav:1",
     "paths convert S.wav:0:1 -o x.npy": "S.wav:0:1 does not exist",
     "paths convert S.wav:S -o x.npy": "S.wav is an audio file, which has no named variables",
-    "paths identify stereo.wav stereo.wav --channel 0 --taps 8 -o x.npy": "sample for sample: is it the error microphone?",
+    "paths identify stereo.wav:0 stereo.wav:0 --taps 8 -o x.npy": "sample for sample: is it the error microphone?",
     # An option that nothing uses.
     "verdict noise.wav PATHS --rated-power 1 --ohm 8 --volts-per-unit 2": "--ohm and --volts-per-unit would",
     "verdict noise.wav PATHS --rated-power 1 --rating sine": "--rating would not be used",
-    "run --references 0 --errors 1 --rated-power 1 --file-fs 8000 --channel 0": "--file-fs and --channel would not",
+    "run --references 0 --errors 1 --rated-power 1 --file-fs 8000 --microphones 1": "--microphones and --file-fs would not",
 }
 
 
@@ -129,15 +129,6 @@ def test_an_interrupt_while_python_loads_the_command_gives_one_line(tmp_path):
     )  # fmt: skip
     assert (ended.returncode, ended.stdout) == (130, "")
     assert ended.stderr == "kfopc: interrupted; each file is as it was, or was written whole\n"
-
-
-def test_a_file_of_one_channel_is_left_alone_by_the_choice_of_a_channel(command):
-    options = ["--rated-power", "4", "--taps", "32", "--json", "--algorithm", "FxLMS"]
-    code, chosen, _ = command("verdict", "stereo.wav", *SCENE[1:], *options, "--channel", "1")
-    assert code == 0
-    one, of_both = (json.loads(text) for text in (command("verdict", *SCENE, *options)[1], chosen))
-    assert one.pop("origin") != of_both.pop("origin")  # the commands
-    assert one == of_both
 
 
 def test_rates_that_differ_are_resampled_each_in_its_way(command):

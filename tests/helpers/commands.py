@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SCENE = ["noise.wav", "--primary", "P.wav", "--secondary", "S.wav"]
 
 
-def process(folder: Path, *arguments: str, standard_input: bytes | None = None) -> subprocess.CompletedProcess:
+def process(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "kfopc_filterpy", *arguments]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, input=standard_input)
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True)
