@@ -27,7 +27,6 @@ extensions = [
     "numpydoc",
     "myst_nb",
     "sphinx_copybutton",
-    "sphinx_design",
     "search_words",  # docs/extensions: words that the search ranks first
     "source_lines",  # docs/extensions: the package's source with line numbers, and links into it
     "public_names",  # docs/extensions: a reference page for each public name
@@ -50,7 +49,7 @@ nb_execution_raise_on_error = True
 nb_merge_streams = True
 nb_output_stderr = "warn"  # a warning in a cell is an error of the page
 nb_render_markdown_format = "gfm"
-myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
 myst_links_external_new_tab = True
 

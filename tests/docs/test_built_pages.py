@@ -27,7 +27,7 @@ return [...document.querySelectorAll("mjx-container > svg")].map(svg => svg.getB
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
     """The pages as HTML; the tutorials are not run."""
-    pytest.importorskip("sphinx_design", reason="needs the extra `docs`")
+    pytest.importorskip("myst_nb", reason="needs the extra `docs`")
     folder = tmp_path_factory.mktemp("html")
     command = [sys.executable, "-m", "sphinx", "-q", "-W", ROOT / "docs", folder]
     subprocess.run(command, check=True, env=os.environ | {"DOCS_WITHOUT_TUTORIALS": "1"})
