@@ -415,15 +415,15 @@ class Rated(Twins):
         filters=st.tuples(*[st.integers(1, 2)] * 2),
         m=st.integers(1, 3),
         x_ndim=st.integers(1, 2),
-        unheard=st.booleans(),
+        unheard=st.integers(0, 2),
         seed=seeds,
     )
     def start(
-        self, loudspeakers: int | None, filters: tuple[int, int], m: int, x_ndim: int, unheard: bool, seed: int
+        self, loudspeakers: int | None, filters: tuple[int, int], m: int, x_ndim: int, unheard: int, seed: int
     ) -> None:
         """None: one loudspeaker, whose rated power is a number."""
         self.loudspeakers, references, taps = loudspeakers or 1, filters[0] if loudspeakers else 1, filters[1]
-        self.unheard, self.references = unheard and self.loudspeakers > 1, references
+        self.unheard, self.references = min(unheard, self.loudspeakers), references
         rated = np.array([0.5, 2.0])[: self.loudspeakers]
         each = [OutputPowerConstraint(power, fs=FS, memory_s=MEMORY_S) for power in rated]
         n = self.loudspeakers * references * taps
@@ -437,8 +437,7 @@ class Rated(Twins):
 
     def row(self, rng: np.random.Generator) -> np.ndarray:
         row = super().row(rng)
-        if self.unheard:
-            row[:, : row.shape[1] // 2] = 0.0
+        row[:, : row.shape[1] * self.unheard // self.loudspeakers] = 0.0
         return row
 
     def model(self, rng: np.random.Generator) -> dict[str, Any]:
@@ -446,10 +445,8 @@ class Rated(Twins):
 
     def reference(self, may_lack: bool = False) -> dict[str, Any]:
         """Return an argument of `update`: one reference as a number, several as (I,), or none if it is not needed."""
-        if (
-            may_lack
-            and self.powers is not None
-            and self.powers.supplied.keys() & {"constraint_factor", "secondary_path_gain"}
+        if may_lack and (
+            self.powers is None or self.powers.supplied.keys() & {"constraint_factor", "secondary_path_gain"}
         ):
             return {}
         x = self.rng.normal(size=self.references)
@@ -547,7 +544,7 @@ class Rated(Twins):
 
 
 class RatedWalk(Rated, RandomWalk):
-    loudspeakers, references, unheard = 1, 1, False
+    loudspeakers, references, unheard = 1, 1, 0
 
     @initialize(n=st.integers(1, 9), x_ndim=st.integers(1, 2), seed=seeds)
     def start(self, n: int, x_ndim: int, seed: int) -> None:

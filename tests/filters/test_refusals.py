@@ -106,6 +106,7 @@ SEQUENTIAL = {
     "f.update_sequential(0, 1.0, H_i=nan * ROW)": "H_i must be finite",
     "f.update_sequential(0, 1.0, R_i=nan)": "R_i must be finite",
     "f.update_sequential(0, 1.0, H_i=0 * ROW, R_i=0.0)": "a silent reference",
+    "f.update_sequential(0, 1e308, R_i=1e-12, H_i=1e-3 * ROW, reference=1.0)": "NaN, Inf|finite square",
     "f.update_sequential(0, np.ma.masked)": "z must not be masked, except in update",
     "f.update_sequential(-1, 1.0)": "z_i must stay within the dim_z = 1 measurements, got 1 from start = -1 on",
     "f.update_sequential(0, [1.0, 2.0])": "z_i must stay within the dim_z = 1 measurements, got 2 from start = 0 on",
