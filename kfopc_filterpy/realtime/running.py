@@ -439,8 +439,11 @@ def _open(interface: Interface) -> Iterator[None]:
     try:
         interface.start()
         yield
-    finally:
-        interface.stop()
+    except BaseException:
+        with suppress(Exception):  # the first one counts
+            interface.stop()
+        raise
+    interface.stop()
 
 
 def _warm_up(supervisor: Supervisor, block: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -53,7 +54,7 @@ class SoundDevice:
         sounddevice or the PortAudio library is missing.
     ValueError
         No error microphone or loudspeaker, a negative channel, or one that is both a reference and an error; at the
-        start, a card that cannot be opened.
+        start, a card that cannot be opened or started.
 
     Examples
     --------
@@ -116,11 +117,23 @@ class SoundDevice:
                 latency=self.latency,
                 callback=self._exchange,
             )
+            self._stream.start()
         except sounddevice.PortAudioError as error:
+            with suppress(Exception):  # it has failed already, and the first error counts
+                self.stop()
             raise ValueError(
-                f"the sound card cannot be opened: {error}. `python -m sounddevice` lists the devices and their channels"
+                f"the sound card cannot be opened at {self.fs:g} Hz: {error}.{self._own_rate(sounddevice)} `python -m "
+                "sounddevice` lists the devices and their channels"
             ) from error
-        self._stream.start()
+
+    def _own_rate(self, sounddevice: Any) -> str:
+        """Return the card's own sample rate as a sentence, nothing if it does not say."""
+        device = self.device[0] if isinstance(self.device, tuple) else self.device
+        try:
+            rate = sounddevice.query_devices(device, "input")["default_samplerate"]
+        except Exception:  # noqa: BLE001 - it has failed already, and the first error counts
+            return ""
+        return f" Its own rate is {rate:g} Hz."
 
     def _exchange(self, heard: np.ndarray, played: np.ndarray, frames: int, times: Any, status: Any) -> None:
         """Take a block and give one, on PortAudio's thread; where none is ready, silence."""
@@ -155,10 +168,14 @@ class SoundDevice:
 
     def stop(self) -> None:
         """Close the stream."""
-        if self._stream is not None:
-            self._stream.stop()
-            self._stream.close()
-            self._stream = None
+        stream, self._stream = self._stream, None
+        if stream is None:
+            return
+        try:
+            stream.stop()
+            stream.close()
+        except Exception as error:
+            raise FaultError(f"the sound card did not stop as it should: {error}; was it unplugged?") from error
 
 
 def _indices(channels: Sequence[int], name: str) -> list[int]:

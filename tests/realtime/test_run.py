@@ -439,13 +439,62 @@ def test_a_card_that_is_gone_is_an_error(plugged: Callable[..., Card]) -> None:
         device.read()
 
 
-def test_a_card_that_cannot_be_opened_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def stream(**asked: Any) -> None:
-        raise OSError("Error querying device -1")
+class PortAudioError(Exception):
+    """As sounddevice's: no error of Python's own."""
 
-    monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=stream, PortAudioError=OSError))
-    with pytest.raises(ValueError, match=r"cannot be opened: Error querying device -1.* lists the devices"):
-        SoundDevice([0], [1], fs=FS).start()
+
+class BrokenCard(Card):
+    """A card whose driver fails when it is opened, started or stopped."""
+
+    def __init__(self, interface: SimulatedInterface, fails: Sequence[str]) -> None:
+        super().__init__(interface)
+        self.fails, self.lost_at, self.dry_at = fails, [], []
+
+    def _try(self, what: str) -> None:
+        if what in self.fails:
+            raise PortAudioError(f"Error in {what}: Invalid sample rate")
+
+    def __call__(self, **asked: Any) -> Card:
+        self._try("opening")
+        return super().__call__(**asked)
+
+    def start(self) -> None:
+        self._try("starting")
+
+    def stop(self) -> None:
+        self._try("stopping")
+
+
+@pytest.mark.parametrize("fails", [["opening"], ["starting"], ["starting", "stopping"], ["stopping"]])
+def test_a_card_that_fails_is_one_error_which_names_both_rates(
+    monkeypatch: pytest.MonkeyPatch, fails: list[str]
+) -> None:
+    card = BrokenCard(plant(latency=32), fails)
+    known = SimpleNamespace(
+        Stream=card, PortAudioError=PortAudioError, query_devices=lambda device, kind: {"default_samplerate": 44100.0}
+    )
+    monkeypatch.setitem(sys.modules, "sounddevice", known)
+    message = rf"opened at {FS:g} Hz: Error in {fails[0]}: Invalid .* Its own rate is 44100 Hz.* lists the devices"
+    if fails == ["stopping"]:
+        message = "did not stop as it should: Error in stopping"
+    with pytest.raises((ValueError, FaultError), match=message):
+        run(
+            lambda identified: fx_lms(32, identified.plant, step_size=1e-3),
+            PluggedDevice(card),
+            amplitude_limit=10.0,
+            seconds=0.5,
+            listen_s=0.1,
+            identify_s=0.5,
+        )
+
+
+def test_an_error_in_a_run_is_not_hidden_by_one_of_the_card(monkeypatch: pytest.MonkeyPatch) -> None:
+    card = BrokenCard(plant(latency=32), ["stopping"])
+    monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=card, PortAudioError=PortAudioError))
+    device = SoundDevice([2], [3], [1], fs=FS, block=32)
+    device.patience_s = 0.01
+    with pytest.raises(FaultError, match="no block came from the sound card"):
+        run(fx_lms(32, S, step_size=1e-3), device, amplitude_limit=10.0)
 
 
 def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(uninstall: Callable[[str], None]) -> None:
