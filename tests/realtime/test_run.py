@@ -25,6 +25,7 @@ from kfopc_filterpy.realtime import (
     SoundDevice,
     interfaces,
     run,
+    running,
 )
 
 FS = 8000.0
@@ -63,11 +64,12 @@ def started(interface: Interface, step_size: float = 2e-3, **changed: Any) -> An
 
 
 class Clock:
-    """Stands for the module `time`: its time passes only while somebody sleeps."""
+    """Stands for the module `time`: its time passes while somebody sleeps, and by a tick with every look at it."""
 
-    now = 100.0
+    now, tick = 100.0, 0.0
 
     def perf_counter(self) -> float:
+        self.now += self.tick
         return self.now
 
     def sleep(self, seconds: float) -> None:
@@ -240,8 +242,11 @@ def test_the_report_is_of_the_second_half_of_a_run_of_any_length(blocks: int, be
     np.testing.assert_allclose(before / 10 ** (report.reduction_db / 10), np.mean(errors[begin:]), rtol=1e-12)
 
 
-def test_a_report_has_the_levels_since_the_last_one() -> None:
+def test_a_report_has_the_levels_since_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the share of a block that its processing took: a tick of half a second."""
     reports: list[RunStatus] = []
+    monkeypatch.setattr(running, "time", clock := Clock())
+    clock.tick = 0.2
     _, errors, played, before = watched(6, report_every_s=1.0, on_report=reports.append)
     assert [status.time_s for status in reports] == [1.0, 2.0, 3.0]
     error, output = (np.mean(powers.reshape(3, 2), axis=1) for powers in (errors, played))
@@ -249,7 +254,7 @@ def test_a_report_has_the_levels_since_the_last_one() -> None:
     np.testing.assert_allclose([status.error_level_db[0] for status in reports], 10 * np.log10(error))
     np.testing.assert_allclose([status.reduction_db[0] for status in reports], 10 * np.log10(before / error))
     np.testing.assert_allclose([status.reference_level_db[0] for status in reports], 10 * np.log10(4 * error))
-    assert all(0.0 < status.load < 1.0 for status in reports)
+    assert [status.load for status in reports] == pytest.approx([0.4] * 3)
     assert reports[0].rated_power == [0.5]
 
 
