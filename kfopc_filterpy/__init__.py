@@ -1,8 +1,8 @@
 """Kalman filter with output power constraint (KF-OPC) for active noise control, an extension of filterpy.
 
-What everyone uses is here; the rest is in the namespaces `filters`, `power`, `controllers`, `paths`, `signals`, `bounds`,
-`metrics`, `verdict`, `realtime`, `export` and `plot`. Each name stands once, in the `__init__.pyi` beside this file or in a
-namespace's, and is loaded when it is first used.
+What everyone uses is here; the rest is in the namespaces `filters`, `power`, `controllers`, `paths`, `signals`,
+`bounds`, `metrics`, `verdict`, `realtime`, `export` and `plot`. Each name stands once, in the `__init__.pyi` beside
+this file or in a namespace's, and is loaded when it is first used.
 """
 
 import sys

@@ -1,7 +1,7 @@
 """Paths as taps: arrays, python-control systems and recordings are read here, one path or a matrix of them.
 
-Systems are in discrete time with `dt = 1/fs`; `path_taps` gives the finite impulse response that a sample-by-sample loop
-runs.
+Systems are in discrete time with `dt = 1/fs`; `path_taps` gives the finite impulse response that a sample-by-sample
+loop runs.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from .signals.recordings import Recording
 
 # Share of an impulse response's energy that may be cut off: -60 dB.
 _TRUNCATION_CUT = 1e-6
-# Channels of which a plant has fewer: an axis that is longer than this and than that of the taps was meant to be theirs.
+# Channels of which a plant has fewer: an axis that is longer than this and than that of the taps was meant to be
+# theirs.
 _MANY_CHANNELS = 8
 SECONDARY_AXES = "(K microphones, J loudspeakers, taps)"
 PRIMARY_AXES = "(K microphones, I references, taps)"
@@ -215,7 +216,7 @@ def primary_paths(
 def feedback_paths(
     paths: PathModels, *, fs: float | None = None, n_taps: int | None = None, name: str = "feedback"
 ) -> tuple[np.ndarray, float | None]:
-    """Return the paths from the loudspeakers to the reference microphones as taps (I, J, n_taps), and their sampling rate."""
+    """Return the paths from loudspeakers to reference microphones as taps (I, J, n_taps), and their sampling rate."""
     taps, rate = path_matrix(paths, fs=fs, n_taps=n_taps, name=name, axes=FEEDBACK_AXES)
     for first in taps[..., 0].flat:
         if first != 0.0:

@@ -1,4 +1,7 @@
-"""Types of arguments and results that occur in many signatures. They are read by type checkers, and import only numpy."""
+"""Types of arguments and results that occur in many signatures.
+
+They are read by type checkers, and import only numpy.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,8 @@ if TYPE_CHECKING:
     import control
     import numpy as np
 
-# A float with one channel, with several an array with a number for each, (n,). As with numpy's own functions that return
-# a number or an array, it is Any: with a union, a type checker would have every caller check which of them came.
+# A float with one channel, with several an array with a number for each, (n,). As with numpy's own functions that
+# return a number or an array, it is Any: with a union, a type checker would have every caller check which of them came.
 NumberOrArray: TypeAlias = Any
 PerLoudspeaker: TypeAlias = float | ArrayLike  # one number for all loudspeakers, or one for each, (J,)
 PerMicrophone: TypeAlias = float | ArrayLike  # one number for all microphones, or one for each, (K,)

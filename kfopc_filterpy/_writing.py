@@ -1,7 +1,7 @@
 """Files that are written whole: beside their place, forced to the disk, and then renamed.
 
-So the disk may be full, the process killed or a file written onto its own source: what was there before stays, or all of
-the new is there. Files that belong together change together.
+So the disk may be full, the process killed or a file written onto its own source: what was there before stays, or all
+of the new is there. Files that belong together change together.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 def replacing_files(folder: Path) -> Iterator[Path]:
     """Yield an empty folder. When the block ends, its files take the same places in `folder`, all of them or none.
 
-    Other files of `folder` stay. A second process that writes there waits for this one, except on Windows. If the process
-    is killed among the renames, which take milliseconds, then the files at the top of `folder` are missing, because
-    they go first and come last: no page stands beside sounds of another run.
+    Other files of `folder` stay. A second process that writes there waits for this one, except on Windows. If the
+    process is killed among the renames, which take milliseconds, then the files at the top of `folder` are missing,
+    because they go first and come last: no page stands beside sounds of another run.
     """
     _remove_abandoned(folder, "files")
     made = Path(tempfile.mkdtemp(prefix=".files.", suffix=".part", dir=folder))

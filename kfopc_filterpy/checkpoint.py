@@ -4,9 +4,9 @@ A file is an archive of numpy's (``.npz``). It has the arrays of the object, eac
 ``header``, JSON with the version of the package and everything else. The comment of the archive is the SHA-256 of all
 bytes before it.
 
-An object in the header is the name of its class, and what ``__getstate__`` returns, for a copy and a file alike. What an
-object holds twice is still one thing. Only the package's own classes, and those that the caller of `load` passes, can be
-named; nothing else that a file names is looked up, and nothing in a file is code.
+An object in the header is the name of its class, and what ``__getstate__`` returns, for a copy and a file alike. What
+an object holds twice is still one thing. Only the package's own classes, and those that the caller of `load` passes,
+can be named; nothing else that a file names is looked up, and nothing in a file is code.
 """
 
 from __future__ import annotations
@@ -74,16 +74,16 @@ class Checkpointed:
         FileNotFoundError
             A folder that does not exist.
         TypeError
-            An attribute that cannot be stored: a function, or an object of your own class without the methods ``state()``
-            and ``restore(state)``. The message names it. Nothing was written.
+            An attribute that cannot be stored: a function, or an object of your own class without the methods
+            ``state()`` and ``restore(state)``. The message names it. Nothing was written.
 
         Notes
         -----
         Call it between two samples, after `update`, and from the thread that calls the other methods. Simulated paths,
         and the position in a recording, are not part of a filter or controller: keep them yourself.
 
-        ``state()`` of your own class returns numbers, strings, arrays, lists, tuples and dicts of them, or other objects
-        that can be saved. ``restore(state)`` gets them in a new object, which was made without ``__init__``.
+        ``state()`` of your own class returns numbers, strings, arrays, lists, tuples and dicts of them, or other
+        objects that can be saved. ``restore(state)`` gets them in a new object, which was made without ``__init__``.
 
         Examples
         --------
@@ -131,13 +131,13 @@ class Checkpointed:
             A file with an object of another class.
         ValueError
             A file that is cut short, damaged or that `save` did not write; that was written by a version of the package
-            with another major or minor number, or by one whose core has another layout; that names a class of yours which
-            is not in `classes`.
+            with another major or minor number, or by one whose core has another layout; that names a class of yours
+            which is not in `classes`.
 
         Notes
         -----
-        Loading runs no code from the file. But the checksum finds damage, not intent, and compiled code trusts the numbers
-        of a state: do not load files that you do not trust.
+        Loading runs no code from the file. But the checksum finds damage, not intent, and compiled code trusts the
+        numbers of a state: do not load files that you do not trust.
 
         See Also
         --------
@@ -182,7 +182,7 @@ def _series() -> str:
 
 
 def _by_attributes(kind: type) -> bool:
-    """Tell whether objects of a class are saved by their attributes, those of other classes by `state` and `restore`."""
+    """Tell whether objects of a class are saved by their attributes; others are by `state` and `restore`."""
     return kind.__module__.startswith(f"{__package__}.") or issubclass(kind, (Checkpointed, KalmanFilter))
 
 

@@ -592,7 +592,8 @@ def a_weighting_db(frequencies_hz: ArrayLike) -> np.ndarray:
 
        A(f) &= 20 \log_{10} R(f) - A_{1000}
 
-       R(f) &= \frac{f^2}{f^2 + f_1^2}\, \frac{f}{\sqrt{f^2 + f_2^2}}\, \frac{f}{\sqrt{f^2 + f_3^2}}\, \frac{f_4^2}{f^2 + f_4^2}
+       R(f) &= \frac{f^2}{f^2 + f_1^2}\, \frac{f}{\sqrt{f^2 + f_2^2}}\, \frac{f}{\sqrt{f^2 + f_3^2}}\, \frac{f_4^2}{f^2
+       + f_4^2}
 
     Parameters
     ----------
@@ -678,10 +679,10 @@ def third_octave_levels_db(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the levels in third-octave bands from 25 Hz on.
 
-    The bands are those of IEC 61260-1 with base ten: exact centres ``1000 * 10**(k/10)``, edges half a tenth of a decade
-    to each side. The filters are Butterworth band-passes of eight poles, which keep to class 1 of that standard. The
-    signal is filtered from its beginning, and the level is the mean over the steady portion. Bands that do not end below
-    0.48 fs are left out, and those in which the portion is shorter than one over the bandwidth.
+    The bands are those of IEC 61260-1 with base ten: exact centres ``1000 * 10**(k/10)``, edges half a tenth of a
+    decade to each side. The filters are Butterworth band-passes of eight poles, which keep to class 1 of that standard.
+    The signal is filtered from its beginning, and the level is the mean over the steady portion. Bands that do not end
+    below 0.48 fs are left out, and those in which the portion is shorter than one over the bandwidth.
 
     Parameters
     ----------

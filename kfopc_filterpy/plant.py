@@ -75,8 +75,8 @@ class Plant:
     Raises
     ------
     ValueError
-        Paths that are empty, not finite, without a finite response, or of shapes that do not fit one another; sample rates
-        that differ, or no sample rate; a feedback path without delay.
+        Paths that are empty, not finite, without a finite response, or of shapes that do not fit one another; sample
+        rates that differ, or no sample rate; a feedback path without delay.
     TypeError
         An amplifier that is not a function, or not one for each loudspeaker.
 
@@ -182,15 +182,15 @@ class Plant:
         Parameters
         ----------
         time_s : float
-            Time of the change in seconds from the start of the reference: not before the last change, and after the last
-            change of the same paths or amplifiers has ended.
+            Time of the change in seconds from the start of the reference: not before the last change, and after the
+            last change of the same paths or amplifiers has ended.
         secondary, primary, feedback : as for `Plant`, optional
             New paths, with the same channels; by default they stay.
         amplifier : callable or sequence of J of them, optional
             New amplifier; by default it stays. `LinearAmplifier()` is a linear one.
         crossfade_s : float, default 0
-            Time in seconds in which the taps go linearly from the old to the new paths. 0 switches at once; an amplifier is
-            always switched.
+            Time in seconds in which the taps go linearly from the old to the new paths. 0 switches at once; an
+            amplifier is always switched.
 
         Returns
         -------
@@ -463,7 +463,7 @@ Secondary: TypeAlias = "PathModels | Plant"
 
 
 def estimated_secondary(secondary: Any) -> tuple[np.ndarray, float | None]:
-    """Return secondary paths as taps (K, J, n_taps), and their sample rate in Hz if they tell it: those of a plant, too."""
+    """Return secondary paths, also a plant's, as taps (K, J, n_taps), and their sample rate in Hz if they tell it."""
     if isinstance(secondary, Plant):
         plant = as_constant_plant(secondary, "an estimate of the secondary path")
         return plant.secondary.copy(), plant.fs
@@ -471,7 +471,10 @@ def estimated_secondary(secondary: Any) -> tuple[np.ndarray, float | None]:
 
 
 def _common_rate(rates: dict[str, float]) -> float:
-    """Return the sample rate in Hz of the paths that tell one, by their names; ValueError if none does, or they differ."""
+    """Return the sample rate in Hz of the paths that tell one, by their names.
+
+    ValueError if none does, or they differ.
+    """
     if not rates:
         raise ValueError("fs must be given, the sample rate in Hz: taps have none, unlike systems and recordings")
     first, fs = next(iter(rates.items()))

@@ -15,8 +15,8 @@ def measurement_noise_from_run(
 ) -> float:
     r"""Estimate the measurement noise variance from a run without control.
 
-    With the loudspeaker silent, the error microphone records the disturbance d. The part of it that no control filter of
-    `n_taps` taps explains is e_o of eq. 1b: the batch least-squares residual of d on the filtered reference.
+    With the loudspeaker silent, the error microphone records the disturbance d. The part of it that no control filter
+    of `n_taps` taps explains is e_o of eq. 1b: the batch least-squares residual of d on the filtered reference.
 
     Parameters
     ----------
@@ -44,7 +44,8 @@ def measurement_noise_from_run(
     -----
     numpy.exceptions.RankWarning
         If q cannot be told: the reference is so narrow-band that float64 correlations do not resolve all directions of
-        the weights, and weights in those would explain part of the residual. The estimate is then too high by at least 6 dB.
+        the weights, and weights in those would explain part of the residual. The estimate is then too high by at least
+        6 dB.
 
     Examples
     --------

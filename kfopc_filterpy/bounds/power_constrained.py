@@ -243,13 +243,14 @@ def power_constrained_wiener(
        λ\,(E[y^2] - ρ_o) = 0
 
     is a bound: no filter of `n_taps` taps that stays fixed over the stretch does better within the power, unless its
-    weights are very large in the directions left out (below). A filter that adapts may do better if the noise changes within the stretch. The bound is fitted to the stretch it is judged on, so
-    by chance alone it removes about ``n_taps / fs`` per second of what the reference does not explain. The bound of each
-    second meets the budget in each second, that of the record on average; which of them is better depends on the noise.
+    weights are very large in the directions left out (below). A filter that adapts may do better if the noise changes
+    within the stretch. The bound is fitted to the stretch it is judged on, so by chance alone it removes about ``n_taps
+    / fs`` per second of what the reference does not explain. The bound of each second meets the budget in each second,
+    that of the record on average; which of them is better depends on the noise.
 
-    With several loudspeakers, microphones or references the sum of the squared errors is minimised, and each loudspeaker
-    j has a budget and a :math:`λ_j` of its own. `scaled` then is the unconstrained solution times the largest factor that
-    keeps every budget: what one constraint factor can do at best.
+    With several loudspeakers, microphones or references the sum of the squared errors is minimised, and each
+    loudspeaker j has a budget and a :math:`λ_j` of its own. `scaled` then is the unconstrained solution times the
+    largest factor that keeps every budget: what one constraint factor can do at best.
 
     Delay lines hold the past of the record, also at the edges of segments, and zeros before its first sample. So only
     the record itself starts up, and the anti-noise at an edge is that of weights that have been there before.

@@ -11,8 +11,9 @@ from .._validate import as_channels
 def predictor_reference(disturbance: ArrayLike) -> np.ndarray:
     r"""Return the reference of a feedback controller whose internal model is exact: the disturbance one sample late.
 
-    With it, every bound of this package, such as `power_constrained_wiener`, applies to feedback control: the control filter
-    w, followed by the secondary path, is the best predictor of d(n) from d(n - 1), d(n - 2), ... within the rated power.
+    With it, every bound of this package, such as `power_constrained_wiener`, applies to feedback control: the control
+    filter w, followed by the secondary path, is the best predictor of d(n) from d(n - 1), d(n - 2), ... within the
+    rated power.
 
     Parameters
     ----------
@@ -22,7 +23,8 @@ def predictor_reference(disturbance: ArrayLike) -> np.ndarray:
     Returns
     -------
     ndarray, of the same shape
-        ``x(n) = d(n - 1)``, and 0 as the first sample. For hybrid control, stack it below the references of the microphones.
+        ``x(n) = d(n - 1)``, and 0 as the first sample. For hybrid control, stack it below the references of the
+        microphones.
 
     Raises
     ------

@@ -18,7 +18,8 @@ from .power_constrained import record_of_any
 from .wiener import ERROR_THAT_MATTERS, Record, mean_square, reduction_db
 
 # A longer memory leaves less error in a steady noise, and a shorter one follows changes: of a motor's speed, and of the
-# constraint factor when the noise gets louder or softer. `python tests/helpers/settings_grid.py` shows what this one costs.
+# constraint factor when the noise gets louder or softer. `python tests/helpers/settings_grid.py` shows what this one
+# costs.
 DEFAULT_MEMORY_S = 0.25
 LONGEST = 256
 GAIN_THAT_MATTERS_DB = 0.1
@@ -96,8 +97,8 @@ def suggest_settings(
         Signal of the error microphone, the disturbance d, in place of the plant's primary path. Leave out its start-up
         transient.
     memory_s : float, default 0.25
-        Memory of the filter in seconds. A longer one leaves less error, a shorter one follows changes of the noise and of
-        the paths faster.
+        Memory of the filter in seconds. A longer one leaves less error, a shorter one follows changes of the noise and
+        of the paths faster.
     n_taps : int, optional
         Length L of the control filter, if you have chosen it. By default it follows from the signals.
     max_taps : int, default 256
@@ -117,8 +118,8 @@ def suggest_settings(
     See Also
     --------
     measurement_noise_from_run : q alone, for a given length.
-    fit_noise : noises of any filter by maximum likelihood. That is for models whose noises are real; the settings here are
-        for a control filter, whose state noise r is chosen for a memory.
+    fit_noise : noises of any filter by maximum likelihood. That is for models whose noises are real; the settings here
+        are for a control filter, whose state noise r is chosen for a memory.
     wiener_solution : the best fixed filter.
     causality_margin : whether the paths leave enough time.
     coherence_bound : how much the reference explains.
@@ -134,21 +135,22 @@ def suggest_settings(
       does not learn within M samples what needs larger weights. The first fraction corrects for what L weights fit by
       chance. The second one is the price of forgetting: for a white filtered reference, P settles at
       :math:`\sqrt{rq/E[x'^2]}` in each direction, and so the error power is :math:`qL/M` above q.
-    - :math:`q = J(L)\, N / (N - L)`, but at least -60 dB of the disturbance, because a microphone is hardly ever quieter.
-    - :math:`r = q / (k\, E[x'^2] M^2)`. If the noise comes in bursts, so does what no filter explains, and it disturbs the
-      weights when the filter's gain is largest. The memory is then lengthened by :math:`\sqrt{k}`: k is the mean square
-      of the power over 10 ms, divided by that of the power over the memory. It is 1 for a steady noise.
-    - :math:`P_0 = E[d^2] / (L\, E[x'^2])`: with independent weights of this variance and a white filtered reference, the
-      anti-noise is as strong as the disturbance.
+    - :math:`q = J(L)\, N / (N - L)`, but at least -60 dB of the disturbance, because a microphone is hardly ever
+      quieter.
+    - :math:`r = q / (k\, E[x'^2] M^2)`. If the noise comes in bursts, so does what no filter explains, and it disturbs
+      the weights when the filter's gain is largest. The memory is then lengthened by :math:`\sqrt{k}`: k is the mean
+      square of the power over 10 ms, divided by that of the power over the memory. It is 1 for a steady noise.
+    - :math:`P_0 = E[d^2] / (L\, E[x'^2])`: with independent weights of this variance and a white filtered reference,
+      the anti-noise is as strong as the disturbance.
 
     With several channels, J and :math:`E[d^2]` are means over the K microphones and :math:`E[x'^2]` is the mean over
-    loudspeakers and references of the sum over microphones, whose measurements inform the same weights. The fractions of
-    L are multiplied by J I / K, the weights per tap and microphone. :math:`P_0` then is
+    loudspeakers and references of the sum over microphones, whose measurements inform the same weights. The fractions
+    of L are multiplied by J I / K, the weights per tap and microphone. :math:`P_0` then is
     :math:`K E[d^2] / (J I L\, E[x'^2])`. `kf_pb` takes only the length and the sample
     rate.
 
-    Directions of the weights with less than 1e-11 of the energy do not count, as in `wiener_solution`. q contains neither
-    what a clipping amplifier cuts off nor the errors of the path estimate, which a silent run does not show.
+    Directions of the weights with less than 1e-11 of the energy do not count, as in `wiener_solution`. q contains
+    neither what a clipping amplifier cuts off nor the errors of the path estimate, which a silent run does not show.
 
     Examples
     --------

@@ -71,10 +71,10 @@ def wiener_solution(
 ) -> WienerSolution:
     r"""Return the least-squares control filter of a reference and a disturbance.
 
-    Minimises :math:`E[(d - w^T x')^2] + \gamma E[(w^T x)^2]` :math:`+ \lambda E[x'^2] \|w\|^2` over the samples at which the
-    delay lines of control filter and secondary path are full: least squares on the data at hand, not the biased
-    autocorrelation. Leave out the start-up transient of the disturbance if it should not count. If the data leave
-    weights undetermined (a tone determines only two numbers), the solution of minimum norm is taken.
+    Minimises :math:`E[(d - w^T x')^2] + \gamma E[(w^T x)^2]` :math:`+ \lambda E[x'^2] \|w\|^2` over the samples at
+    which the delay lines of control filter and secondary path are full: least squares on the data at hand, not the
+    biased autocorrelation. Leave out the start-up transient of the disturbance if it should not count. If the data
+    leave weights undetermined (a tone determines only two numbers), the solution of minimum norm is taken.
 
     Eigenvalues of the correlation matrix below 1e-11 of the largest count as zero, because float64 correlations do not
     resolve them. A narrow-band reference has such eigenvalues, and then a filter with very large weights can have a
@@ -261,8 +261,8 @@ class Correlations:
     def basis(self) -> tuple[np.ndarray, np.ndarray]:
         """A basis V with V.T R_x' V = diag(share) and balance V.T R_x V = diag(1 - share), and the shares.
 
-        Both matrices may be singular. Directions that the path does not pass, which would cost power for nothing, are left
-        out.
+        Both matrices may be singular. Directions that the path does not pass, which would cost power for nothing, are
+        left out.
         """
         values, vectors = np.linalg.eigh(self.filtered + self.balance * self.reference)
         kept = values > RANK_TOLERANCE * values[-1]
@@ -278,7 +278,10 @@ class Correlations:
 
 @dataclass(frozen=True, eq=False)
 class Record(ABC):
-    """Samples that control filters are fitted to. x and x' begin `n_taps` - 1 samples early, to fill the delay lines."""
+    """Samples that control filters are fitted to.
+
+    X and x' begin `n_taps` - 1 samples early, to fill the delay lines.
+    """
 
     x: np.ndarray
     filtered: np.ndarray

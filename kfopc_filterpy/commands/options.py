@@ -96,7 +96,10 @@ def add_scene(parser: argparse._ActionsContainer, *, required: bool) -> None:
 
 def add_recorded_scene(parser: argparse._ActionsContainer) -> None:
     """Add the options for a recorded noise, the paths and the rating."""
-    about = "recording of the reference microphone, made while the loudspeaker is silent; FILE:1 is its channel 1, FILE:NAME its variable NAME"
+    about = (
+        "recording of the reference microphone, made while the loudspeaker is silent; FILE:1 is channel 1 of a file, "
+        "FILE:NAME its variable NAME"
+    )
     parser.add_argument("noise", help=about)
     add_scene(parser, required=True)
     rating = parser.add_argument_group(

@@ -80,7 +80,10 @@ def identify(options: argparse.Namespace) -> int:
 def _judge_residual(
     options: argparse.Namespace, residual_db: float, fs: float, sent: np.ndarray, heard: np.ndarray
 ) -> None:
-    """Raise ValueError if a fit explains hardly more than chance would, or two clocks show; warn if it explains little."""
+    """Raise ValueError if a fit explains hardly more than chance would, or two clocks show.
+
+    Warn if it explains little.
+    """
     from ..paths.timing import timing_fault
     from ..signals.quality import clipping_remarks
 

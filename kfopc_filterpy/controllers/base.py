@@ -25,8 +25,8 @@ class Controller(Protocol):
 
     Optional attributes: `constraint_factor`, `disturbance_power` and `secondary_path_gain` are recorded if present, and
     `weights`, (L,), if requested. `name` names the result. `listen(references, errors)` follows the noise before the
-    control is switched on. If a controller has `n_references`, `n_loudspeakers` or `n_microphones`, a run with other numbers
-    of channels is refused before it begins; otherwise the first sample shows the mismatch.
+    control is switched on. If a controller has `n_references`, `n_loudspeakers` or `n_microphones`, a run with other
+    numbers of channels is refused before it begins; otherwise the first sample shows the mismatch.
     """
 
     def control_signal(self, reference: NumberOrArray) -> NumberOrArray:

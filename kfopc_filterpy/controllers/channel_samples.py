@@ -37,14 +37,17 @@ def amplifier_functions(amplifier: Amplifiers, n_loudspeakers: int) -> list[Any]
 
 
 def amplified(amplifiers: list[Any] | None, y: np.ndarray) -> np.ndarray:
-    """Return what the amplifiers, as far as they are known, make of the control signals (J,); a divergence stays one."""
+    """Return what the amplifiers, as far as they are known, make of the control signals (J,).
+
+    A divergence stays one.
+    """
     if amplifiers is None or not np.isfinite(y).all():
         return y
     return np.array([amplifier(value) for amplifier, value in zip(amplifiers, y.tolist(), strict=True)])
 
 
 def through(paths: np.ndarray, lines: np.ndarray) -> np.ndarray:
-    """Return signals (inputs, taps - 1 + n) filtered by paths (outputs, inputs, taps), without the start: (outputs, n)."""
+    """Return signals (inputs, taps - 1 + n) filtered by paths (outputs, inputs, taps), without the start."""
     rows = np.lib.stride_tricks.sliding_window_view(lines, paths.shape[2], axis=1)[..., ::-1]
     return np.tensordot(paths, rows, axes=((1, 2), (0, 2)))
 

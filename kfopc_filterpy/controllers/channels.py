@@ -1,4 +1,4 @@
-"""The channels of a built-in controller: what its signals and paths must be, numbers with one channel, arrays with several."""
+"""The channels of a built-in controller: numbers with one channel, arrays with several."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The base class of the built-in controllers: their signals, weights and powers are in one block of the core's memory."""
+"""The class of the built-in controllers: their state is in one block of the core's memory."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     rated_power : float or array_like, shape (J,), optional
         Rated power of a constraint with default settings.
     constraint : OutputPowerConstraint or sequence of J of them, optional
-        Given instead of `rated_power`: the constraint that computes the powers and the factor. A copy is kept. By default
-        one whose factor is fixed at 1.
+        Given instead of `rated_power`: the constraint that computes the powers and the factor. A copy is kept. By
+        default one whose factor is fixed at 1.
     fs : float, optional
         Sample rate in Hz for `rated_power`; a system, a recording or a plant as `secondary` brings it.
     limiter : OutputLimiter or sequence of J of them, optional
@@ -71,7 +71,8 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     Attributes
     ----------
     internal_model : bool
-        Whether the last references come from an internal model, see `with_internal_model`; `n_references` are the others.
+        Whether the last references come from an internal model, see `with_internal_model`; `n_references` are the
+        others.
 
     Raises
     ------
@@ -347,7 +348,8 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         :math:`E[(d - w^T x')^2] + E[(w^T x'')^2]` with :math:`x'' = W * x'` and the filter W of `paths.guard_filter`: an
         LMS algorithm gets a leak shaped in frequency, which also limits its step size, and a Kalman filter gets a
         second observation. An uncertainty can be assigned for KF-ANC, KF-OPC, the diagonal Kalman filter and the LMS
-        family, with one channel or several. `kf_pb` takes it as a setting, which cannot be changed, and learns the path.
+        family, with one channel or several. `kf_pb` takes it as a setting, which cannot be changed, and learns the
+        path.
         """
         return deepcopy(self._uncertainty)
 
@@ -376,7 +378,8 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     def rated_power(self, value: PerLoudspeaker) -> None:
         if self.rated_power is None:
             raise ValueError(
-                f"{self.name} has no rated power that could be changed; kf_opc, kf_pb and mov_fx_lms, for example, have one; a limiter keeps one whatever the controller asks for"
+                f"{self.name} has no rated power that could be changed; kf_opc, kf_pb and mov_fx_lms, for example, have "
+                "one; a limiter keeps one whatever the controller asks for"
             )
         if self.multichannel:
             value = per_loudspeaker(value, self.n_loudspeakers, "rated_power")

@@ -154,7 +154,10 @@ class KalmanController(CoreController):
         adapt: bool | ArrayLike = True,
         out: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Process a block, see `BlockProcessing.process`; to the estimator, a sample that is not adapted to is missed."""
+        """Process a block, see `BlockProcessing.process`.
+
+        To the estimator, a sample that is not adapted to is missed.
+        """
         y = super().process(references, errors, adapt=adapt, out=out)
         if not np.ravel(adapt)[-1]:
             self.estimator.update(None)

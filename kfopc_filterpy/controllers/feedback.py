@@ -88,7 +88,7 @@ class FeedbackNeutralizer(WrappedController):
         return f"<{self.name}: {self._n_taps} taps, {self.controller!r}>"
 
     def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
-        """Return the control signal y(n), or (J,), for the newest sample x(n), or (I,), of the reference microphones."""
+        """Return the control signal y(n), or (J,), for the newest reference sample x(n), or (I,)."""
         x = channel_sample(reference, self._sound.n_outputs, "reference", "references") - self._sound.output()
         y = self.controller.control_signal(x if self._several else float(x[0]))
         self._sound.play(y)

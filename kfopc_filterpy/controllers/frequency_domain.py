@@ -176,7 +176,8 @@ class FrequencyDomainController(Channels, BlockProcessing, Checkpointed):
 
     def _divisor(self) -> np.ndarray:
         """Return Lambda, (bins,)."""
-        # A mean lags behind. The newest references will have this power behind the path, whose delay they still have ahead.
+        # A mean lags behind. The newest references will have this power behind the path, whose delay they still have
+        # ahead.
         soon = self._path_gain * np.sum(np.abs(self._X[:, 0]) ** 2, axis=0)
         powers = np.maximum(self._powers, 0.5 * soon)
         # In the time domain, spreading powers over the bins by SPREAD / (2 pi^2 j^2) is a window of their correlation.
@@ -249,7 +250,10 @@ class FrequencyDomainController(Channels, BlockProcessing, Checkpointed):
         return y
 
     def take(self, errors: np.ndarray, taken: ArrayLike = True) -> None:
-        """Take the errors (K, n) that the last n control signals left; `taken`, (n,), says which of them to adapt to."""
+        """Take the errors (K, n) that the last n control signals left.
+
+        `taken`, (n,), says which of them to adapt to.
+        """
         require_moderate(errors, "error", LOUDEST)
         here = slice(self._n - errors.shape[1], self._n)
         self._taken[here] = taken

@@ -57,10 +57,10 @@ def fx_rls(
     Notes
     -----
     Band-limited noise and tones do not excite all directions of the control filter, and silence excites none. In the
-    others P grows by 1/lambda per sample, up to 10^4 times the usual variance along :math:`x'`. From then on, state noise
-    of the same size along :math:`x'` takes the place of forgetting: the filter follows changes, and P stays bounded.
-    Before the first sound, P grows up to 10^6 times `initial_variance`. A reference :math:`x'` whose energy over the taps
-    is below 10^-10 / `initial_variance` counts as silence.
+    others P grows by 1/lambda per sample, up to 10^4 times the usual variance along :math:`x'`. From then on, state
+    noise of the same size along :math:`x'` takes the place of forgetting: the filter follows changes, and P stays
+    bounded. Before the first sound, P grows up to 10^6 times `initial_variance`. A reference :math:`x'` whose energy
+    over the taps is below 10^-10 / `initial_variance` counts as silence.
 
     References
     ----------

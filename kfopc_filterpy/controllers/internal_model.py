@@ -13,8 +13,8 @@ _Made = TypeVar("_Made", bound=CoreController)
 def with_internal_model(controller: _Made) -> _Made:
     r"""Return a controller as a feedback controller, or with reference microphones as a hybrid one.
 
-    The internal model computes the disturbance at each error microphone from the error there and from what the loudspeakers
-    play. Its last sample is a reference of the controller:
+    The internal model computes the disturbance at each error microphone from the error there and from what the
+    loudspeakers play. Its last sample is a reference of the controller:
 
     .. math::
 
@@ -22,10 +22,10 @@ def with_internal_model(controller: _Made) -> _Made:
 
        \hat d_k(n) = e_k(n) + \sum_j (\hat s_{kj} * y_j)(n)
 
-    The error e(n) is only known after y(n) has been played, so the newest sample is that of n - 1. With an exact estimate
-    of the secondary path, the controller is that of a feedforward system whose reference is d(n - 1): it predicts the
-    disturbance over the delay of the secondary path. Otherwise, the error of the estimate closes a loop through the
-    control filter; `paths.internal_model_margin` says which error this loop tolerates.
+    The error e(n) is only known after y(n) has been played, so the newest sample is that of n - 1. With an exact
+    estimate of the secondary path, the controller is that of a feedforward system whose reference is d(n - 1): it
+    predicts the disturbance over the delay of the secondary path. Otherwise, the error of the estimate closes a loop
+    through the control filter; `paths.internal_model_margin` says which error this loop tolerates.
 
     This is not what `FeedbackNeutralizer` is for: that class removes the sound of the loudspeakers from the signal
     of a reference microphone (acoustic feedback).
@@ -46,16 +46,16 @@ def with_internal_model(controller: _Made) -> _Made:
     Raises
     ------
     TypeError
-        An object that is not a `CoreController`: a wrapper (wrap the result instead), or a controller that adapts once per
-        block or is in plain Python.
+        An object that is not a `CoreController`: a wrapper (wrap the result instead), or a controller that adapts once
+        per block or is in plain Python.
     ValueError
         A controller with fewer references than error microphones, or one that already has an internal model.
 
     Notes
     -----
-    In the weights, (J, I + K, L), those for the disturbances come last. An error that is refused, or never given, counts as
-    silence: the next reference is 0. If a limiter or a known amplifier changes the control signal, the model uses
-    the signal that results. `process` takes the errors of samples with ``adapt=False`` as references, too.
+    In the weights, (J, I + K, L), those for the disturbances come last. An error that is refused, or never given,
+    counts as silence: the next reference is 0. If a limiter or a known amplifier changes the control signal, the model
+    uses the signal that results. `process` takes the errors of samples with ``adapt=False`` as references, too.
 
     References
     ----------

@@ -77,8 +77,8 @@ def kf_anc(
 ) -> KalmanInCore:
     """Return KF-ANC, the Kalman filter of eq. 2-8 without a constraint.
 
-    The state has the control filters of all loudspeakers for all references, (J, I, L), and the filtered references of a
-    microphone are its observation row. The K measurements of a sample have independent noises, so they correct the
+    The state has the control filters of all loudspeakers for all references, (J, I, L), and the filtered references of
+    a microphone are its observation row. The K measurements of a sample have independent noises, so they correct the
     weights one after the other, in O(K (J I L)^2) operations.
 
     Parameters
@@ -193,8 +193,8 @@ def kf_opc(
     Returns
     -------
     CoreController
-        A controller named KF-OPC. With several loudspeakers, `constraint_factor` is (J,), each loudspeaker's own factor;
-        the smallest one is applied.
+        A controller named KF-OPC. With several loudspeakers, `constraint_factor` is (J,), each loudspeaker's own
+        factor; the smallest one is applied.
 
     Raises
     ------
@@ -236,7 +236,10 @@ def kf_opc(
 def kalman_settings(
     state_noise: float, measurement_noise: PerMicrophone, initial_variance: float, fading: float = 1.0
 ) -> dict[str, Any]:
-    """Return the settings of the core's Kalman filter; `fading` is the factor of P in each sample, filterpy's alpha squared."""
+    """Return the settings of the core's Kalman filter.
+
+    `fading` is the factor of P in each sample, filterpy's alpha squared.
+    """
     return {
         "state_noise": state_noise,
         "measurement_noise": measurement_noise,

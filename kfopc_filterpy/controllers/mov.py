@@ -106,8 +106,8 @@ def mov_fx_lms(
     limiter : OutputLimiter, optional
         As for `fx_lms`.
     penalty_factor : float or array_like, shape (J,), optional
-        Fixed penalty factor gamma, or that of each loudspeaker, zero or above; the function `penalty_factor` computes it for a rated power. By
-        default gamma follows the running powers.
+        Fixed penalty factor gamma, or that of each loudspeaker, zero or above; the function `penalty_factor` computes
+        it for a rated power. By default gamma follows the running powers.
     modified : bool, default False
         Adapt to ``d^ - w' x'`` instead of the error, in the modified structure of Lai et al. The delay of the secondary
         path then does not limit the step size. The controller is named MOV-MFxLMS.

@@ -42,8 +42,8 @@ class BlockProcessing:
     ) -> np.ndarray:
         """Return the control signals of a block of samples, and adapt to its errors.
 
-        This is `control_signal` and `update` for each sample in turn, so the results do not depend on how a recording is
-        cut into blocks. The errors of a block must have been measured before its control signals are known. In a
+        This is `control_signal` and `update` for each sample in turn, so the results do not depend on how a recording
+        is cut into blocks. The errors of a block must have been measured before its control signals are known. In a
         real-time process this holds if the estimated secondary path includes the delay of the blocks: the path then
         begins with at least as many zeros as a block has samples.
 
@@ -147,12 +147,18 @@ def block_signals(controller: Any, references: Any, errors: Any) -> tuple[np.nda
 
 
 def states_channels(controller: object) -> bool:
-    """Return whether a controller states its channels; for virtual microphones and a user's controller, a sample shows them."""
+    """Return whether a controller states its channels.
+
+    For virtual microphones and a user's controller, a sample shows them.
+    """
     return hasattr(controller, "multichannel") and not hasattr(controller, "physical")
 
 
 def takes_none(controller: object, references: object) -> bool:
-    """Return whether a controller takes no references; raise ValueError if it gets some, or needs them and gets none."""
+    """Return whether a controller takes no references.
+
+    Raise ValueError if it gets some, or needs them and gets none.
+    """
     none = getattr(controller, "n_references", 1) == 0
     given: Any = references
     if none and references is not None and np.size(given):

@@ -295,7 +295,7 @@ class VirtualMicrophones(WrappedController):
 
     @property
     def multichannel(self) -> bool:
-        """Whether signals have a channel axis: always, since the plant has a physical and a virtual microphone at least."""
+        """Whether signals have a channel axis: always, since there are two microphones at least."""
         return True
 
     def _indices(self, value: Any, name: str) -> np.ndarray:

@@ -22,7 +22,8 @@ from pathlib import Path
 FOLDER = Path(__file__).resolve().parent
 REALS = ("double", "float")
 LEVELS = ("baseline", "x86-64-v3", "x86-64-v4")  # from the lowest; other processors have the first only
-# What Python assumes about the core beyond its sources. A change here makes every library that is built already too old.
+# What Python assumes about the core beyond its sources. A change here makes every library that is built already too
+# old.
 LAYOUT = 1
 # The promise of equal bits on every machine rests on these: no contraction, no reassociation. The rest is for speed.
 FLAGS = (
@@ -72,7 +73,10 @@ def _pip() -> str:
 
 
 def machine_compiler() -> list[str]:
-    """Return the command of $CC, cc, gcc or clang, or nothing. On Windows, only $CC makes libraries that fit this Python."""
+    """Return the command of $CC, cc, gcc or clang, or nothing.
+
+    On Windows, only $CC makes libraries that fit this Python.
+    """
     if named := shlex.split(os.environ.get("CC", ""), posix=os.name == "posix"):
         return named
     names = () if os.name == "nt" else ("cc", "gcc", "clang")

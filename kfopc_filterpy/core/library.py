@@ -22,8 +22,8 @@ VISITOR = ctypes.PYFUNCTYPE(
     *(ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_int, ctypes.c_size_t),
     ctypes.POINTER(ctypes.c_int32),
 )
-# Types of the functions in anc.h that Python calls, first that of the result: - nothing, P a pointer, i and q integers of
-# 32 and 64 bits, N a size, r a number of the core, V a visitor.
+# Types of the functions in anc.h that Python calls, first that of the result: - nothing, P a pointer, i and q integers
+# of 32 and 64 bits, N a size, r a number of the core, V a visitor.
 _TYPES = {"-": None, "P": ctypes.c_void_p, "i": ctypes.c_int32, "q": ctypes.c_int64, "N": ctypes.c_size_t, "V": VISITOR}
 _CALLS = {
     "size": "NPP",

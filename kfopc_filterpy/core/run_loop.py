@@ -166,7 +166,10 @@ class Plant:
         return out
 
     def play(self, signals: Signals, begin: int, end: int) -> NDArray[np.float64]:
-        """Send the amplifiers' outputs of the samples from `begin` to `end` through the paths; return the errors, (K, n)."""
+        """Send the amplifiers' outputs of the samples from `begin` to `end` through the paths.
+
+        Return the errors, (K, n).
+        """
         _library.anc_play(ctypes.byref(self._struct), self._pointers(signals), begin, end)
         return signals.error[:, begin:end]
 

@@ -105,8 +105,8 @@ def export_c(
         `kf_anc`, `kf_opc`, `kf_pb` and `fx_rls` return, with whatever it has: several channels,
         limiters, amplifier models, an uncertain secondary path, sliding windows. It is not changed.
     path : str or pathlib.Path
-        Source file to write, ending in ``.c``; its header, ending in ``.h``, is written beside it. Or a folder, which is
-        made if its name has no dot. Existing files are replaced.
+        Source file to write, ending in ``.c``; its header, ending in ``.h``, is written beside it. Or a folder, which
+        is made if its name has no dot. Existing files are replaced.
     name : str, optional
         Prefix of all names, `anc` above; by default the name of the file. In a folder it names the files too, and
         `anc` is the default.

@@ -9,7 +9,8 @@ from ..core.run_loop import SOFT_SATURATION
 from ..core.triangle import GROUP
 
 OF_POWERS, OF_LIMITER, OF_SOFT_AMPLIFIER = 12, 43, 150  # multiplications for each loudspeaker
-# Multiplications per weight, beyond those of y: of the diagonal filter for each row of x' that a sample learns from, or in all.
+# Multiplications per weight, beyond those of y: of the diagonal filter for each row of x' that a sample learns from, or
+# in all.
 OF_DIAGONAL = 8
 IN_ALL = {"leaky": 2, "optimal_leaky": 2, "mov": 2, "mov_fixed": 2}
 

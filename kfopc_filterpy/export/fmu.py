@@ -42,9 +42,9 @@ def export_fmu(
 
     The unit has the files of `export_c` and binaries of them for Linux and Windows on x86-64, so its outputs are those
     of Python to the bit. A step is a sample, 1/fs. It takes the inputs ``error``, which the last control signal left,
-    and ``reference``, and sets the output ``control_signal``; ``answer`` is what the update returned, 0 if it adapted. With
-    several channels, their names are ``reference[1]`` and so on. No output depends on an input of the same moment, so
-    a plant closes no algebraic loop with it. Its state can be saved, restored and serialized.
+    and ``reference``, and sets the output ``control_signal``; ``answer`` is what the update returned, 0 if it adapted.
+    With several channels, their names are ``reference[1]`` and so on. No output depends on an input of the same moment,
+    so a plant closes no algebraic loop with it. Its state can be saved, restored and serialized.
 
     Parameters
     ----------

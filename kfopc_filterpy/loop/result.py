@@ -94,7 +94,10 @@ class SimulationResult:
 
     @property
     def noise_reduction_db(self) -> float:
-        """Noise reduction over the second half of the run in dB, see `metrics.noise_reduction_db`; NaN after a divergence."""
+        """Noise reduction over the second half of the run in dB, see `metrics.noise_reduction_db`.
+
+        NaN after a divergence.
+        """
         return metrics.noise_reduction_db(self.error, self.disturbance)
 
     @property
@@ -107,7 +110,7 @@ class SimulationResult:
         return metrics.nse_db(self.error, self.disturbance, self.fs, window_s)
 
     def convergence_time_s(self) -> float:
-        """Return the time in seconds from which the error stays near its steady value, see `metrics.convergence_time_s`."""
+        """Return the time in s from which the error stays near its steady value, see `metrics.convergence_time_s`."""
         return metrics.convergence_time_s(self.error, self.disturbance, self.fs)
 
     def plot(self) -> Figure:

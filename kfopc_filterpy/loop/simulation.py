@@ -83,8 +83,8 @@ def simulate(
     Parameters
     ----------
     controllers : Controller or sequence of them
-        Controller, or several separate ones. Each continues from its present state, while the paths start silent: make a
-        new one for a fresh run.
+        Controller, or several separate ones. Each continues from its present state, while the paths start silent: make
+        a new one for a fresh run.
     reference : array_like, shape (n_samples,) or (I, n_samples), or None
         Reference x; a `Recording` must have the plant's sample rate. None for a feedback controller, see
         `controllers.with_internal_model`.
@@ -98,8 +98,8 @@ def simulate(
         listens (`listen`): its delay lines and power estimates follow the noise, its weights stay. The result starts at
         that time.
     rng : int or numpy.random.Generator, optional
-        Seed of the sensor noise; required if there is any. For several controllers one seed, with which all have the same
-        noise, or a list with one each.
+        Seed of the sensor noise; required if there is any. For several controllers one seed, with which all have the
+        same noise, or a list with one each.
     record_weights_every : int, optional
         Record the control filter (a controller's `control_filter`, or else its `weights`) every so many samples.
     progress : callable, optional
@@ -114,10 +114,10 @@ def simulate(
     Raises
     ------
     ValueError
-        Signals that are empty, not finite, of different lengths or with other channels than plant and controller; sample
-        rates that differ; both or neither of a primary path and a disturbance; a plant that changes after the end of the
-        run; a list of another length than the controllers. Nothing was changed. During a run: an amplifier that returns
-        NaN, or an update without a solution (a covariance that is too large).
+        Signals that are empty, not finite, of different lengths or with other channels than plant and controller;
+        sample rates that differ; both or neither of a primary path and a disturbance; a plant that changes after the
+        end of the run; a list of another length than the controllers. Nothing was changed. During a run: an amplifier
+        that returns NaN, or an update without a solution (a covariance that is too large).
     TypeError
         A controller without `control_signal` and `update`, or a plant that is no `Plant`.
 
@@ -357,7 +357,7 @@ class _Run:
         return False, n_samples
 
     def _blocks(self) -> tuple[bool, int]:
-        """Do what `_steps` does for a controller that keeps its control filter for a block, in stretches within its blocks."""
+        """Do what `_steps` does, in stretches, for a controller that keeps its control filter for a block."""
         x, every = self.x, self.every or 1
         begin, changes, n_samples, limit = 0, 0, x.shape[1], self.plant.limit[:, None]
         # The first sample that the controller refuses begins a stretch, so that those before it are run.

@@ -30,9 +30,9 @@ class FeedbackMargin:
     stable : bool
         Whether the loop is stable.
     disk_margin : float
-        Disk margin alpha of the balanced sensitivity: the loop stays stable if its response is multiplied by any complex
-        factor in the disk that reaches from minus to plus `gain_margin_db` on the real axis. It is 2, the largest
-        value, without any feedback, and 0 if the loop is unstable.
+        Disk margin alpha of the balanced sensitivity: the loop stays stable if its response is multiplied by any
+        complex factor in the disk that reaches from minus to plus `gain_margin_db` on the real axis. It is 2, the
+        largest value, without any feedback, and 0 if the loop is unstable.
     gain_margin_db : float
         By how many dB the gain of the loop may rise or fall, at any frequency.
     phase_margin_deg : float
@@ -40,8 +40,8 @@ class FeedbackMargin:
     frequency_hz : float
         Frequency in Hz at which the disk margin is smallest.
     path_error : float
-        Relative error of the loop's path that the loop tolerates at every frequency, whatever its phase: with a path times
-        ``1 + delta`` it is stable as long as ``|delta| < path_error``. It is 1/max|T|, the disk margin of the
+        Relative error of the loop's path that the loop tolerates at every frequency, whatever its phase: with a path
+        times ``1 + delta`` it is stable as long as ``|delta| < path_error``. It is 1/max|T|, the disk margin of the
         complementary sensitivity T (skew -1); Inf if there is no loop, and 0 if the loop is unstable.
     path_error_hz : float
         Frequency in Hz at which the tolerated error is smallest.
@@ -52,12 +52,12 @@ class FeedbackMargin:
 
     Notes
     -----
-    With several channels, delta is a matrix that multiplies the path from the left, for errors of the microphones, or from
-    the right, for errors of the loudspeakers. ``|delta|`` is its largest singular value. ``|T|`` is the larger of the
-    largest singular values of T with the loop opened at the microphones and at the loudspeakers. So all channels may be
-    wrong at once, in any way. The disk margin allows a different factor for each microphone, or for each loudspeaker. It
-    is at most that of `control.disk_margins`, which uses the structured singular value and needs slycot for several
-    channels.
+    With several channels, delta is a matrix that multiplies the path from the left, for errors of the microphones, or
+    from the right, for errors of the loudspeakers. ``|delta|`` is its largest singular value. ``|T|`` is the larger of
+    the largest singular values of T with the loop opened at the microphones and at the loudspeakers. So all channels
+    may be wrong at once, in any way. The disk margin allows a different factor for each microphone, or for each
+    loudspeaker. It is at most that of `control.disk_margins`, which uses the structured singular value and needs slycot
+    for several channels.
     """
 
     stable: bool
@@ -140,10 +140,10 @@ def feedback_margin(control_filter: PathModels, plant: Plant, estimate: PathMode
 
     Notes
     -----
-    The loop has a finite impulse response, so by Nyquist's criterion it is stable if ``1 - W (F - F^)`` does not encircle
-    the origin; with several channels, this is the determinant of ``I - (F - F^) W``. The margins are those at the worst
-    frequency of a grid with a spacing of fs/65536 or less. The adaptation changes w, so the margin holds for this
-    control filter only.
+    The loop has a finite impulse response, so by Nyquist's criterion it is stable if ``1 - W (F - F^)`` does not
+    encircle the origin; with several channels, this is the determinant of ``I - (F - F^) W``. The margins are those at
+    the worst frequency of a grid with a spacing of fs/65536 or less. The adaptation changes w, so the margin holds for
+    this control filter only.
 
     References
     ----------
@@ -185,8 +185,9 @@ def internal_model_margin(
 ) -> FeedbackMargin:
     r"""Return whether a feedback controller's loop is stable, and which error of its secondary path it tolerates.
 
-    An internal model subtracts from the error what it expects the loudspeaker to contribute, and the control filter gets the
-    rest one sample late; see `controllers.with_internal_model`. Seen from the error microphone, this is a feedback loop
+    An internal model subtracts from the error what it expects the loudspeaker to contribute, and the control filter
+    gets the rest one sample late; see `controllers.with_internal_model`. Seen from the error microphone, this is a
+    feedback loop
 
     .. math:: L = \frac{z^{-1} W S}{1 - z^{-1} W \hat S}, \qquad
        \frac{1}{1 + L} = \frac{1 - z^{-1} W \hat S}{1 + z^{-1} W (S - \hat S)}
@@ -217,12 +218,13 @@ def internal_model_margin(
 
     Notes
     -----
-    The notes of `feedback_margin`, which is for acoustic feedback, hold here too. A hybrid controller may have both loops.
+    The notes of `feedback_margin`, which is for acoustic feedback, hold here too. A hybrid controller may have both
+    loops.
 
     Examples
     --------
-    A path that delays by one sample and a filter that predicts half of the disturbance, then the same with a path 2.9 and 3.1
-    times as large as its estimate:
+    A path that delays by one sample and a filter that predicts half of the disturbance, then the same with a path 2.9
+    and 3.1 times as large as its estimate:
 
     >>> from kfopc_filterpy import Plant
     >>> from kfopc_filterpy.paths import internal_model_margin
@@ -265,7 +267,7 @@ def _require_fit(w: np.ndarray, path: np.ndarray, n_inputs: int) -> None:
 
 
 def _margin(w: np.ndarray, path: np.ndarray, estimate: np.ndarray, fs: float) -> FeedbackMargin:
-    """Return the margins of the loop from `w`, (J, K, taps), through the difference of path and estimate, (K, J, taps)."""
+    """Return the margins of the loop from `w`, (J, K, taps), through path minus estimate, (K, J, taps)."""
     paths = (w, path, estimate)
     n_taps = len(path) * (w.shape[2] + max(path.shape[2], estimate.shape[2]))  # of the determinant, at most
     size = max(_GRID, 2 ** int(np.ceil(np.log2(_POINTS_PER_TAP * n_taps))))
@@ -297,7 +299,7 @@ def _returned(w: np.ndarray, path: np.ndarray, estimate: np.ndarray) -> np.ndarr
 
 
 def _largest(centre: float, w: np.ndarray, path: np.ndarray, estimate: np.ndarray) -> np.ndarray:
-    """Return the largest singular value of ``centre I - T`` at each frequency, seen from microphones or loudspeakers."""
+    """Return the largest singular value of ``centre I - T`` at each frequency."""
     driven = w @ np.linalg.inv(_returned(w, path, estimate))  # control signals for a disturbance of 1
     norms = []
     for T in (path @ driven, driven @ path):

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def require_different(disturbance: str, heard: np.ndarray, noise: str, reference: np.ndarray) -> None:
-    """Raise ValueError if a channel of the disturbance, (n_channels, n_samples), is one of the noise, sample for sample."""
+    """Raise ValueError if a channel of the disturbance, (n_channels, n_samples), is one of the noise."""
     for k, i in np.ndindex(len(heard), len(reference)):
         if np.array_equal(heard[k], reference[i]):
             raise ValueError(

@@ -53,8 +53,8 @@ class PathEstimate:
     taps : numpy.ndarray, shape (n_taps,) or (K, J, n_taps)
         Its impulse response, or that from each of J loudspeakers to each of K microphones.
     residual_db : float or numpy.ndarray, shape (K,) or (K, J)
-        Share of the response's power that the fit leaves unexplained, in dB: noise, distortion by the amplifier, and the
-        part of the path beyond `n_taps`. At least -300 dB. With several paths one for each response: (K,) if all
+        Share of the response's power that the fit leaves unexplained, in dB: noise, distortion by the amplifier, and
+        the part of the path beyond `n_taps`. At least -300 dB. With several paths one for each response: (K,) if all
         loudspeakers played at once, (K, J) if in turn.
     uncertainty : numpy.ndarray, shape (257,)
         Relative error of the fit that must be expected at evenly spaced frequencies from 0 to fs/2, because of noise,
@@ -93,8 +93,8 @@ def estimate_path(
     The paths from several loudspeakers can be recorded in two ways. In turn: one loudspeaker plays at a time, and its
     paths are fitted to its own recording. At once: all play noises that are not correlated, and all paths to a
     microphone are fitted to its response together. Noise of the microphones then costs no more accuracy than in runs of
-    this length for each loudspeaker. But what no fit explains, such as distortion and the paths beyond `n_taps`, adds up
-    over all loudspeakers.
+    this length for each loudspeaker. But what no fit explains, such as distortion and the paths beyond `n_taps`, adds
+    up over all loudspeakers.
 
     Parameters
     ----------
@@ -114,13 +114,14 @@ def estimate_path(
     Returns
     -------
     PathEstimate
-        The path as a system, its taps, the residual and the uncertainty. Of paths (K, J, n_taps) unless both signals are (n_samples,).
+        The path as a system, its taps, the residual and the uncertainty. Of paths (K, J, n_taps) unless both signals
+        are (n_samples,).
 
     Raises
     ------
     TypeError, ValueError
-        If the signals differ in length, are shorter than ``(J + 1) n_taps - 1`` (in turn, or with one loudspeaker,
-        ``2 n_taps - 1``), silent or not finite, or loudspeakers play the same noise at once; if more than 16384 taps in all
+        If the signals differ in length, are shorter than ``(J + 1) n_taps - 1`` (in turn, or with one loudspeaker, ``2
+        n_taps - 1``), silent or not finite, or loudspeakers play the same noise at once; if more than 16384 taps in all
         are to be fitted without a ridge.
 
     Examples
@@ -258,10 +259,10 @@ def squared_error(sent: np.ndarray, left: np.ndarray, taps: np.ndarray, regulari
 
     Notes
     -----
-    The error has three parts. Noise of spectral density R, not correlated with the excitation of density X, gives a fit of
-    L taps to N samples the variance ``L R / (N X)`` [1]_; it counts `CONFIDENCE` times. The path beyond L taps is the
-    part of the residual that is correlated with the excitation, the cross-spectrum over X; it counts if it is larger
-    than chance makes it. The ridge makes the response too small by its share of X.
+    The error has three parts. Noise of spectral density R, not correlated with the excitation of density X, gives a fit
+    of L taps to N samples the variance ``L R / (N X)`` [1]_; it counts `CONFIDENCE` times. The path beyond L taps is
+    the part of the residual that is correlated with the excitation, the cross-spectrum over X; it counts if it is
+    larger than chance makes it. The ridge makes the response too small by its share of X.
 
     References
     ----------
@@ -323,8 +324,8 @@ def identify_secondary_path(
 ) -> IdentificationResult:
     """Simulate the identification of secondary paths, as it is done before the control starts.
 
-    The excitation runs through the amplifier and the true path, sensor noise is added, and `estimate_path` fits the taps
-    to excitation and response. Several loudspeakers play in turn, or noises of their own at once.
+    The excitation runs through the amplifier and the true path, sensor noise is added, and `estimate_path` fits the
+    taps to excitation and response. Several loudspeakers play in turn, or noises of their own at once.
 
     Parameters
     ----------

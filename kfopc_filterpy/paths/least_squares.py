@@ -37,8 +37,8 @@ def cross_correlation(output: np.ndarray, regressor: np.ndarray) -> np.ndarray:
 def correlation_matrix(signals: np.ndarray, n_taps: int) -> np.ndarray:
     """Return the mean of ``signals[a, n - i] * signals[b, n - j]`` over n >= n_taps - 1, (C n_taps, C n_taps).
 
-    `signals` are (C, n_samples), or (n_samples,) for C = 1. Each row of a block is computed from the one above by adding the
-    products that enter the window and subtracting those that leave it.
+    `signals` are (C, n_samples), or (n_samples,) for C = 1. Each row of a block is computed from the one above by
+    adding the products that enter the window and subtracting those that leave it.
     """
     signals = np.atleast_2d(signals)
     n_signals, length = signals.shape
@@ -74,9 +74,9 @@ def minimum_norm_solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 def ridge_solve(signals: np.ndarray, right: np.ndarray, ridges: np.ndarray) -> np.ndarray:
     """Return the solution of ``correlation_matrix(signals, n_taps) + ridges`` without that matrix.
 
-    Conjugate gradients multiply by the matrix as two convolutions. The Toeplitz matrix that it would be if the signals were
-    periodic, one for each signal, is the preconditioner. If the samples are four times as many as the taps, 10 to 100 steps
-    suffice for noise; if they are twice as many, thousands are taken.
+    Conjugate gradients multiply by the matrix as two convolutions. The Toeplitz matrix that it would be if the signals
+    were periodic, one for each signal, is the preconditioner. If the samples are four times as many as the taps, 10 to
+    100 steps suffice for noise; if they are twice as many, thousands are taken.
 
     Parameters
     ----------

@@ -127,8 +127,8 @@ def perturbed_path(
 
     The response wanted is ``H(f) * 10^(gain_db/20) * exp(j phase) * exp(-j 2 pi f delay)``. Gains, whole samples of
     delay and multiples of 180 degrees are exact. Any other phase (the same at all frequencies, a Hilbert-type rotation)
-    and fractions of a sample are fitted by least squares over 0.01 fs to 0.45 fs with 64 additional taps. For 90 degrees
-    on the paper's 32-tap path at 16 kHz the fit is accurate to 2.5 degrees and 0.4 dB over 300-4500 Hz, and to
+    and fractions of a sample are fitted by least squares over 0.01 fs to 0.45 fs with 64 additional taps. For 90
+    degrees on the paper's 32-tap path at 16 kHz the fit is accurate to 2.5 degrees and 0.4 dB over 300-4500 Hz, and to
     1.5 degrees over 500-4500 Hz; for fractional delays it is better than 0.1 degree.
 
     Parameters

@@ -28,16 +28,16 @@ def read_path(
     """Read the impulse response of a path: all formats of `read_recording`, and text exported by REW.
 
     At another rate, an impulse response keeps its sum, which is the path's gain, where a recording keeps its height; so
-    `resample_path` is what resamples it. The first tap is at time 0. A file that states the time of its first sample (REW,
-    text with a column of times) is shifted, to the nearest sample, and what is before time 0 is cut off.
+    `resample_path` is what resamples it. The first tap is at time 0. A file that states the time of its first sample
+    (REW, text with a column of times) is shifted, to the nearest sample, and what is before time 0 is cut off.
 
     Parameters
     ----------
     path : path
         The file.
     fs : float, optional
-        Sampling frequency wanted in Hz: a path with another is resampled by `resample_path`. By default it stays as it is.
-        A file that states no rate is taken to be sampled at `fs`, unless `file_fs` says otherwise.
+        Sampling frequency wanted in Hz: a path with another is resampled by `resample_path`. By default it stays as it
+        is. A file that states no rate is taken to be sampled at `fs`, unless `file_fs` says otherwise.
     channel : int, optional
         Channel to read, from 0. By default all are read.
     variable : str, optional
@@ -45,8 +45,8 @@ def read_path(
     unit : str, optional
         Unit of the taps, after scaling: "Pa/V". By default "1".
     unit_per_full_scale : float, optional
-        What the number 1 in the file stands for, in `unit`: the factor of the recording at the path's end over the factor of
-        the signal at its beginning.
+        What the number 1 in the file stands for, in `unit`: the factor of the recording at the path's end over the
+        factor of the signal at its beginning.
     file_fs : float, optional
         Sampling frequency in Hz of a file that states none.
 
@@ -61,8 +61,8 @@ def read_path(
     FileNotFoundError, OSError, ModuleNotFoundError, ValueError, TypeError
         As `read_recording`.
     ValueError
-        If more than -40 dB of the energy is before time 0, as in a measurement without a timing reference; if the file is
-        REW's minimum-phase version; if a path cannot be resampled, see `resample_path`.
+        If more than -40 dB of the energy is before time 0, as in a measurement without a timing reference; if the file
+        is REW's minimum-phase version; if a path cannot be resampled, see `resample_path`.
 
     See Also
     --------

@@ -23,8 +23,8 @@ def resample_path(path: PathModel, new_fs: float, *, fs: float | None = None) ->
     """Return a path at another sampling rate, with the same frequency response and the same delay in seconds.
 
     An impulse response is no recording. Resampled like one, it would keep its height, and its frequency response, a sum
-    over all taps, would change by ``new_fs / fs``. So the taps are resampled by `scipy.signal.resample_poly` and multiplied by
-    ``fs / new_fs``.
+    over all taps, would change by ``new_fs / fs``. So the taps are resampled by `scipy.signal.resample_poly` and
+    multiplied by ``fs / new_fs``.
 
     Up to 80 % of the lower of the two frequencies ``fs/2``, the response differs from the old one by less than 0.4 % of
     its peak (0.03 dB), and by up to 1 % if the path hardly has a delay. Above that it falls off, and what the new rate

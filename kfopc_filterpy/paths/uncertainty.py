@@ -1,20 +1,23 @@
 r"""Uncertainty of a secondary path, and the short filter that guards a controller against it.
 
-The true path is :math:`S = (1 + \Delta)\hat S` with :math:`|\Delta(\omega)| \le \delta(\omega)`. A control filter that is
-g times the best one for the disturbance estimate :math:`\hat d = e + \hat s * y` leaves, once the adaptation has settled,
+The true path is :math:`S = (1 + \Delta)\hat S` with :math:`|\Delta(\omega)| \le \delta(\omega)`. A control filter that
+is g times the best one for the disturbance estimate :math:`\hat d = e + \hat s * y` leaves, once the adaptation has
+settled,
 
 .. math:: E = D\,\frac{1 - g}{1 + g\Delta}
 
-If the frequencies adapt independently, each settles if :math:`g\delta < 1`. The noise is not louder than without control if
+If the frequencies adapt independently, each settles if :math:`g\delta < 1`. The noise is not louder than without
+control if
 :math:`|1 + g\Delta| \ge 1 - g`. The part g of the control filter that is allowed:
 
 - Within a `PathTolerance`, :math:`1 + \Delta = \rho e^{j\theta}` with a largest phase :math:`\theta`. Then
   :math:`g = \min(1, 0.94/\delta)` up to a phase of 135 degrees, and 0 beyond. With a phase above 90 degrees, some g makes
   the noise louder, by a factor of at most :math:`1/\sin\theta`, whatever :math:`\rho` is. That is 3 dB at 135 degrees.
   With several loudspeakers, 90 degrees is the limit.
-- If only :math:`\delta` is known, the phase of the error can be anything, and only g = 0 is safe where :math:`\delta > 1`.
-  Therefore :math:`g = 1 - \delta^6`, which costs next to nothing where the path is known well; :math:`g\delta` is at most
-  0.62, up to a :math:`\delta` of 100. With more microphones than loudspeakers, the same g is used for a tolerance.
+- If only :math:`\delta` is known, the phase of the error can be anything, and only g = 0 is safe where :math:`\delta >
+  1`. Therefore :math:`g = 1 - \delta^6`, which costs next to nothing where the path is known well; :math:`g\delta` is
+  at most 0.62, up to a :math:`\delta` of 100. With more microphones than loudspeakers, the same g is used for a
+  tolerance.
 
 A controller gets this g from a penalty on the control signal through the filter W with :math:`|W|^2 = (1 - g)/g`:
 
@@ -283,7 +286,7 @@ def guard_filter(uncertainty: Uncertainty | None, secondary: Secondary) -> np.nd
 
 
 def allowed_share(uncertainty: Uncertainty | None, secondary: Secondary) -> np.ndarray:
-    """Return the part g of the control filter that an uncertainty allows, (257,), at evenly spaced frequencies to fs/2."""
+    """Return the part g of the control filter that an uncertainty allows, (257,), from 0 to fs/2."""
     paths, _ = estimated_secondary(secondary)
     if _knows_phase(uncertainty, secondary):
         limit = LARGEST_PHASE_DEG if paths.shape[1] == 1 else LARGEST_PHASE_OF_SEVERAL_DEG
@@ -300,8 +303,8 @@ def _knows_phase(uncertainty: Any, secondary: Secondary) -> TypeGuard[PathTolera
 def _short_filter(power: np.ndarray, least: np.ndarray) -> np.ndarray:
     """Return the minimum-phase filter whose ``|W|^2`` is a local mean of `power`, given from 0 to fs/2, and at least `least`.
 
-    The spectrum of Bohman's window is nowhere negative. So g does not overshoot where it falls steeply, as it would if W
-    were cut off. A narrow peak disappears in the mean, so it is raised until the mean is large enough.
+    The spectrum of Bohman's window is nowhere negative. So g does not overshoot where it falls steeply, as it would if
+    W were cut off. A narrow peak disappears in the mean, so it is raised until the mean is large enough.
     """
     lags = np.arange(1 - GUARD_TAPS, GUARD_TAPS)
     window = windows.bohman(lags.size)

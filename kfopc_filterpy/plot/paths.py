@@ -1,7 +1,7 @@
 """Figures of paths.
 
-Each function draws into `ax`, or into new axes, and returns the axes. Paths are python-control systems, which know their
-sampling rate, or arrays of taps, which need `fs`.
+Each function draws into `ax`, or into new axes, and returns the axes. Paths are python-control systems, which know
+their sampling rate, or arrays of taps, which need `fs`.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def plot_bode(
     Parameters
     ----------
     paths : path, or mapping of str to path
-        Paths by legend entry: ``{"P": primary, "S": secondary, "Ŝ": estimate}``. A path is a python-control system or an
-        impulse response.
+        Paths by legend entry: ``{"P": primary, "S": secondary, "Ŝ": estimate}``. A path is a python-control system or
+        an impulse response.
     frequencies_hz : array_like, optional
         Frequencies in Hz; by default 2000 from 20 Hz to fs/2.
     fs : float, optional

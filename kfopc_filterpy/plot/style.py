@@ -12,8 +12,8 @@ from .._types import NumberOrArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Colour, line style and marker of each algorithm. The first seven have Okabe and Ito's colours, which colour-blind readers
-# tell apart; line styles and markers serve prints in grey.
+# Colour, line style and marker of each algorithm. The first seven have Okabe and Ito's colours, which colour-blind
+# readers tell apart; line styles and markers serve prints in grey.
 _DASHED = (0, (5, 2))
 STYLES: dict[str, tuple[str, Any, str]] = {
     "KF-OPC": ("#0072B2", "-", "o"),

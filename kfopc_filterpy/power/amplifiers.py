@@ -146,7 +146,7 @@ def _each(amplifier: Any, n_loudspeakers: int) -> list[Any]:
 
 
 def amplifier_of_each(amplifier: Any, n_loudspeakers: int) -> list[Any]:
-    """Return for each loudspeaker a function that stands for its amplifier, or None, from one for all or one for each."""
+    """Return the amplifier of each loudspeaker, a function or None, from one for all or one for each."""
     each = _each(amplifier, n_loudspeakers)
     if len(each) != n_loudspeakers or not all(one is None or callable(one) for one in each):
         for_each = f", or one for each of the {n_loudspeakers} loudspeakers" if n_loudspeakers > 1 else ""

@@ -29,8 +29,8 @@ LOUDEST = 100.0  # times the largest output: louder input is planned for as if i
 
 _SETTINGS = ("scale", "peak", "budget", "limit", "planned", "attack", "calm", "fade", "release", "size", "spans")
 _CHANGING = ("position", "spent", "arrived", "average", "loud", "known", "gain", "clipped")
-# The structure of the core, see anc.h. Spans of the window, by horizon: their length, the largest recent input energy in
-# one, and the largest output energy allowed in one.
+# The structure of the core, see anc.h. Spans of the window, by horizon: their length, the largest recent input energy
+# in one, and the largest output energy allowed in one.
 NUMBERS = np.dtype(
     [(name, np.float64) for name in (*_SETTINGS, *_CHANGING)]
     + [(f"{name}_{i}", np.float64) for name in ("horizon", "held", "room") for i in range(HORIZONS)]
@@ -40,8 +40,8 @@ NUMBERS = np.dtype(
 class LimiterState(NamedTuple):
     """State that the core reads and updates.
 
-    A lap is N samples. The rows of `laps`, N + 1 each, are the output energies, the input energies and this lap's output
-    energies one by one; limiter.c says how they are used.
+    A lap is N samples. The rows of `laps`, N + 1 each, are the output energies, the input energies and this lap's
+    output energies one by one; limiter.c says how they are used.
     """
 
     numbers: np.ndarray  # (1,) of NUMBERS: settings, then values that each sample updates
@@ -220,7 +220,8 @@ class OutputLimiter:
             for array, theirs in zip(own, other.state, strict=True):
                 array[...] = theirs
             return
-        # A complete lap of the louder ones; its sums, from each sample on, are those that `start_lap` in limiter.c makes.
+        # A complete lap of the louder ones; its sums, from each sample on, are those that `start_lap` in limiter.c
+        # makes.
         squares = np.maximum(before, played)
         own.laps[2, :-1] = squares
         own.laps[:2, 1:-1] = np.cumsum(squares[::-1])[::-1][1:]
@@ -228,7 +229,7 @@ class OutputLimiter:
         own.numbers["position"] = own.numbers["spent"] = own.numbers["arrived"] = 0.0
 
     def _played(self, other: OutputLimiter) -> np.ndarray:
-        """Return the energies that another limiter let through, (N,), the oldest first, in units of this one's budget."""
+        """Return the energies that another limiter let through, (N,), oldest first, in units of this one's budget."""
         numbers, size = other.state.numbers, self._state.laps.shape[1] - 1
         squares = np.roll(other.state.laps[2, :-1], -int(numbers["position"][0]))[-size:]
         squares = squares * (self._state.numbers["scale"] / numbers["scale"]) ** 2

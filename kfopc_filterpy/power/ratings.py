@@ -99,7 +99,10 @@ class _Rating:
 
     @property
     def rated_power(self) -> float:
-        """Rated power ρ_o, the largest mean square of the control signal; without watts, that of a sine at the peak voltage."""
+        """Rated power ρ_o, the largest mean square of the control signal.
+
+        Without watts, that of a sine at the peak voltage.
+        """
         watts = self.noise_watt if self.sine_watt is None else self.sine_watt
         if watts is None:
             assert self.peak_volts is not None
@@ -124,8 +127,8 @@ class AmplifierRating(_Rating):
     noise_watt : float, optional
         Power of noise with a crest factor of 2 in W, in place of `sine_watt`.
     peak_volts : float, optional
-        Voltage at which the amplifier clips. By default it follows from the power and its crest factor. Without a power,
-        the power is that of the sine that peaks at this voltage.
+        Voltage at which the amplifier clips. By default it follows from the power and its crest factor. Without a
+        power, the power is that of the sine that peaks at this voltage.
     volts_per_unit : float, optional
         Volts at the amplifier's output for a control signal of 1. If they are not known, 1 V is assumed, and a verdict
         does not state watts.

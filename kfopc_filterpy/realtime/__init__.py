@@ -1,4 +1,4 @@
-"""Control in real time: a supervisor for faults, interfaces to a sound device or a simulated plant, and the run itself."""
+"""Control in real time: interfaces to a sound device or a simulated plant, a supervisor, and the run itself."""
 
 import lazy_loader
 

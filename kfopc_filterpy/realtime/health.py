@@ -38,8 +38,8 @@ class Fault:
 class Health:
     """What a supervisor has noticed.
 
-    It stays small however long the run is, and whatever an exception says: the newest events are kept, and the counts go
-    on. Texts are cut to 200 characters, and after a hundred kinds of events a new kind counts as "other".
+    It stays small however long the run is, and whatever an exception says: the newest events are kept, and the counts
+    go on. Texts are cut to 200 characters, and after a hundred kinds of events a new kind counts as "other".
 
     Attributes
     ----------
@@ -49,9 +49,9 @@ class Health:
     samples : collections.Counter
         Number of samples concerned, by what happened.
     counts : collections.Counter
-        Number of events, by what happened: "not finite", "clipped", "stuck", "offset", "repeated" and "lost" samples
-        of the microphones; "refused" updates; "limited" control signals; "output underflow", a block that came too
-        late for the output; "diverged: ..." and what was done about it, "frozen", "reset" or "muted"; "louder than before
+        Number of events, by what happened: "not finite", "clipped", "stuck", "offset", "repeated" and "lost" samples of
+        the microphones; "refused" updates; "limited" control signals; "output underflow", a block that came too late
+        for the output; "diverged: ..." and what was done about it, "frozen", "reset" or "muted"; "louder than before
         control", which ends in "diverged: louder than without control" or "the noise itself is louder"; "silent: no
         usable input" and "running again".
 

@@ -10,8 +10,8 @@ UNHEARD = 0.1  # of the noise in silence: as much may come from sources that no 
 class Loudness:
     r"""Compare the power of the errors with that of the last silence.
 
-    If a noise changes its level by itself, the references change with it. With the powers X of the references and E of the
-    errors, and X_0 and E_0 in silence, the power to be expected without control is
+    If a noise changes its level by itself, the references change with it. With the powers X of the references and E of
+    the errors, and X_0 and E_0 in silence, the power to be expected without control is
 
     .. math:: D = E_0 \max(X / X_0, 0.1)
 

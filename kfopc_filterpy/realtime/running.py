@@ -328,13 +328,14 @@ def run(
 ) -> RunReport:
     """Control noise in real time, from the identification of the plant to the fade-out at the end.
 
-    In order: listen to the noise with silent loudspeakers; play noise and identify the secondary paths, with the buffers
-    of the interface; check that a control filter can reduce the noise in time; fade in; control; fade out. A `Supervisor`
-    stands between the controller and the interface. The run stops by itself after three divergences within ten minutes.
+    In order: listen to the noise with silent loudspeakers; play noise and identify the secondary paths, with the
+    buffers of the interface; check that a control filter can reduce the noise in time; fade in; control; fade out. A
+    `Supervisor` stands between the controller and the interface. The run stops by itself after three divergences within
+    ten minutes.
 
     The interface is started twice: to listen and identify, and to control. In between the path is computed and the
-    controller is made, which can take seconds. Meanwhile no blocks are read or written. If the streams stayed open, they would overflow
-    and run dry, and the round trip could then differ from the one identified.
+    controller is made, which can take seconds. Meanwhile no blocks are read or written. If the streams stayed open,
+    they would overflow and run dry, and the round trip could then differ from the one identified.
 
     Parameters
     ----------
@@ -619,7 +620,8 @@ def _identified(
 def _fitted(sent: np.ndarray, heard: np.ndarray, n_taps: int, fs: float) -> PathEstimate:
     """Return the path by least squares, with a filter that makes what a first fit has not explained white.
 
-    This is noise that no reference microphone hears. A loud tone, for example, then costs accuracy only at its frequency.
+    This is noise that no reference microphone hears. A loud tone, for example, then costs accuracy only at its
+    frequency.
     """
     from scipy.linalg import solve_toeplitz
     from scipy.signal import fftconvolve, lfilter

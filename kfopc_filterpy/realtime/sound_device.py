@@ -17,8 +17,8 @@ from .running import FaultError
 class SoundDevice:
     """A sound card: microphones at some of its inputs, loudspeakers at some of its outputs.
 
-    It needs the extra ``realtime`` (sounddevice, and the PortAudio library, which its wheels bring on Windows and macOS).
-    It has been tested with JACK's dummy driver and a simulated plant, not on hardware.
+    It needs the extra ``realtime`` (sounddevice, and the PortAudio library, which its wheels bring on Windows and
+    macOS). It has been tested with JACK's dummy driver and a simulated plant, not on hardware.
 
     Parameters
     ----------

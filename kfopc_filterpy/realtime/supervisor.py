@@ -36,16 +36,16 @@ ABSENT = (NOT_FINITE, STUCK, REPEATED)  # kinds of samples that say nothing of h
 class Supervisor(Checkpointed):
     """Run a controller block by block, and keep faults from the loudspeakers.
 
-    Three things hold, whatever the inputs are. The control signal is finite and within `amplitude_limit`. A bad sample is
-    never adapted to: weights, covariance and running powers stay as they are. Every event is counted in `health`.
+    Three things hold, whatever the inputs are. The control signal is finite and within `amplitude_limit`. A bad sample
+    is never adapted to: weights, covariance and running powers stay as they are. Every event is counted in `health`.
 
     A bad sample of a reference also spoils the filtered reference for as long as the control filter and the secondary
     path remember it. The controller therefore adapts again `recovery_samples` after the last bad reference. After a bad
     error, it adapts to the next sample, unless an internal model makes a reference of the error.
 
-    An internal model relies on the control signals being played as they are. So a controller with an internal model gets
-    the errors that it would hear without fades and limits. In place of a missing error, it gets the one that it would
-    hear without noise.
+    An internal model relies on the control signals being played as they are. So a controller with an internal model
+    gets the errors that it would hear without fades and limits. In place of a missing error, it gets the one that it
+    would hear without noise.
 
     Parameters
     ----------
@@ -115,12 +115,12 @@ class Supervisor(Checkpointed):
     - updates that the controller refuses for a tenth of the samples;
     - noise that is louder than before control, for example because a loudspeaker has the wrong polarity.
 
-    For the last one, it compares the power of the errors, the sum over the microphones, with that of the last silence. If
-    the references have become louder or softer since then, as much is expected of the errors, but no fall of more than
-    10 dB. If the mean over `louder_s` is `louder_db` above that, where each window counts at most twice as many dB, the
-    loudspeakers fade out, and the supervisor listens for as long. If the noise is now softer by at least half of
-    `louder_db`, that was a divergence. Otherwise the noise itself has become louder, and the same controller fades in
-    again. Without a reference microphone, noise that becomes louder by itself costs such a silence each time. The
+    For the last one, it compares the power of the errors, the sum over the microphones, with that of the last silence.
+    If the references have become louder or softer since then, as much is expected of the errors, but no fall of more
+    than 10 dB. If the mean over `louder_s` is `louder_db` above that, where each window counts at most twice as many
+    dB, the loudspeakers fade out, and the supervisor listens for as long. If the noise is now softer by at least half
+    of `louder_db`, that was a divergence. Otherwise the noise itself has become louder, and the same controller fades
+    in again. Without a reference microphone, noise that becomes louder by itself costs such a silence each time. The
     loudness is not watched with virtual microphones: it may rightly rise where the microphones are.
 
     `save` and `load` include the controller, its copies, the fades and pauses under way, and the health record. Call

@@ -14,7 +14,8 @@ import numpy as np
 
 from .content import Content, require_room, room_of
 
-# Sizes that a WAV file's header states if its writer could not know it (it wrote to a pipe: ffmpeg, SoX, arecord), or in RF64.
+# Sizes that a WAV file's header states if its writer could not know it (it wrote to a pipe: ffmpeg, SoX, arecord), or
+# in RF64.
 _SIZES_UNKNOWN = (0xFFFFFFFF, 0x7FFFF000, 0x7FFFFFFF, 0x80000000)
 _FORMATS = ("WAV", "WAVEX", "RF64", "AIFF", "FLAC")
 _LOSSLESS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE")  # codings of samples
@@ -74,7 +75,7 @@ def read_audio(path: str | os.PathLike[str]) -> Content:
 
 
 def _as_rf64(path: str | os.PathLike[str]) -> str | os.PathLike[str] | io.BytesIO:
-    """Return a file for libsndfile, which does not know that BW64 (ITU-R BS.2088) is RF64 under another name, or RIFF."""
+    """Return a file for libsndfile, which does not know that BW64 (ITU-R BS.2088) is RF64 or RIFF."""
     with open(path, "rb") as file:
         if file.read(4) != b"BW64":
             return path
@@ -115,7 +116,7 @@ def _require_whole(path: str | os.PathLike[str]) -> _Bits | None:
 
 
 def _claimed_ends(file: BinaryIO, order: str, chunks: Mapping[bytes, Sequence[int]]) -> tuple[int, int]:
-    """Return where the samples end by the header's sizes, 0 if these do not say so, and where the file ends at the earliest."""
+    """Return where the samples end by the header, 0 if it does not say, and where the file ends at the earliest."""
     file.seek(4)
     (size,) = struct.unpack(f"{order}I", file.read(4))
     end = 8 + size if size not in _SIZES_UNKNOWN else 0
@@ -133,7 +134,7 @@ def _claimed_ends(file: BinaryIO, order: str, chunks: Mapping[bytes, Sequence[in
 
 
 def _unclaimed(file: BinaryIO, order: str, end: int) -> int:
-    """Return how many bytes follow the samples that are no chunk: a recorder updates the sizes only from time to time."""
+    """Return how many bytes after the samples are no chunk: a recorder updates the sizes from time to time."""
     file.seek(end)
     rest = file.read()
     if len(rest) < 8 or not rest.strip(b"\0") or rest.startswith(_TAGS):

@@ -42,7 +42,7 @@ class Content(NamedTuple):
 
 
 def require_file(path: str | os.PathLike[str]) -> None:
-    """Raise FileNotFoundError if there is no such file, another OSError if it may not be read, ValueError if it is empty."""
+    """Raise OSError if there is no such file or it may not be read, ValueError if it is empty."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path} does not exist or is not a file; the current folder is {Path.cwd()}")
     with open(path, "rb") as file:
@@ -94,8 +94,8 @@ def channels_first(array: np.ndarray) -> np.ndarray:
 def rate_of_step(step_s: float, path: str | os.PathLike[str], rounding: float = 0.0) -> float:
     """Return the sampling rate for a sample interval, which a text rounds: the roundest number of Hz within 1e-4 of it.
 
-    `rounding` is the share by which the interval may be wrong. If that is more, it counts, and a warning says what is taken.
-    Common rates come before round ones.
+    `rounding` is the share by which the interval may be wrong. If that is more, it counts, and a warning says what is
+    taken. Common rates come before round ones.
     """
     if not (math.isfinite(step_s) and step_s > 0):
         raise ValueError(f"{path} states a sample interval of {step_s:g} s, expected one above 0")
@@ -129,7 +129,10 @@ def agreed_rate(
 
 
 def rounding_of(times: np.ndarray) -> float:
-    """Return the last digit with which times were written, at most: 1e-5 for 0.00002 and 0.00005; 0 if they have many."""
+    """Return the last digit with which times were written, at most: 1e-5 for 0.00002 and 0.00005.
+
+    0 if they have many.
+    """
     for digits in range(10):
         scaled = times * 10.0**digits
         if np.all(np.abs(scaled - np.round(scaled)) < 1e-6):

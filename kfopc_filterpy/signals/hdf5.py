@@ -97,7 +97,7 @@ def _read(path: str | os.PathLike[str], file: Any, name: str) -> np.ndarray:
 
 
 def _require_honest_chunks(path: str | os.PathLike[str], data: Any) -> None:
-    """Raise ValueError if a compressed chunk would become larger than the data set says: HDF5 makes room without limit."""
+    """Raise ValueError if a chunk would become larger than the data set says: HDF5 makes room without limit."""
     plist = data.id.get_create_plist()
     filters = [plist.get_filter(index)[0] for index in range(plist.get_nfilters())]
     if set(filters) - {_DEFLATE, _SHUFFLE, _FLETCHER32} or filters.count(_DEFLATE) > 1:

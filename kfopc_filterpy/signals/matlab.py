@@ -1,4 +1,7 @@
-"""MATLAB files: versions 4 to 7.2, and which version a file has. They are read in a process of their own, see `child`."""
+"""MATLAB files: versions 4 to 7.2, and which version a file has.
+
+They are read in a process of their own, see `child`.
+"""
 
 from __future__ import annotations
 

@@ -40,8 +40,8 @@ def clipping_remarks(samples: ArrayLike, name: str) -> list[str]:
 def _clipped_share(channel: np.ndarray) -> float:
     """Return the share of the samples at an extreme value that the signal reaches in a step, and at which it stays.
 
-    It stays if it is there for three samples and more. So it does at the peaks of a slow tone in whole numbers, too, but
-    there the steps are the smallest that the numbers have.
+    It stays if it is there for three samples and more. So it does at the peaks of a slow tone in whole numbers, too,
+    but there the steps are the smallest that the numbers have.
     """
     values = np.unique(channel)
     if values.size < 3:

@@ -46,7 +46,7 @@ _LARGEST_DRIFT_DB = 0.5
 
 
 class _Format(NamedTuple):
-    """A file format: its name in messages and its reader, which takes a path, and a variable if files have named ones."""
+    """A file format: its name in messages, and its reader, which takes a path, and perhaps a variable."""
 
     name: str
     read: Callable[..., Content]
@@ -180,19 +180,21 @@ def read_recording(
     """Read a recording: WAV, RF64, FLAC, AIFF, MATLAB, .npy, .npz, text, CSV or LabVIEW's .lvm.
 
     The suffix of the file tells its format, or else how the file begins. Whole-number samples of audio files are scaled
-    so that full scale is 1. In formats that hold arrays, the longer axis is time. A first column of text that rises evenly
-    is time (in seconds, or the unit of its heading; without one, the sample number if it rises by 1) and is left out. The
-    page *File formats* has all of it.
+    so that full scale is 1. In formats that hold arrays, the longer axis is time. A first column of text that rises
+    evenly is time (in seconds, or the unit of its heading; without one, the sample number if it rises by 1) and is left
+    out. The page *File formats* has all of it.
 
-    Nothing is unpickled. Files that are compressed may become at most 64 MiB or 100 times their size, whichever is more.
+    Nothing is unpickled. Files that are compressed may become at most 64 MiB or 100 times their size, whichever is
+    more.
 
     Parameters
     ----------
     path : path
         The file.
     fs : float, optional
-        Sampling frequency wanted in Hz: a recording with another is resampled by `scipy.signal.resample_poly`. By default
-        it stays as it is. A file that states no rate is taken to be sampled at `fs`, unless `file_fs` says otherwise.
+        Sampling frequency wanted in Hz: a recording with another is resampled by `scipy.signal.resample_poly`. By
+        default it stays as it is. A file that states no rate is taken to be sampled at `fs`, unless `file_fs` says
+        otherwise.
     channel : int, optional
         Channel to read, from 0. By default all are read.
     variable : str, optional
@@ -222,10 +224,11 @@ def read_recording(
     ModuleNotFoundError
         If the format needs a library of the extra `formats`; the message names it.
     ValueError, TypeError
-        If the file is empty, cut short, damaged, claims more than it has, or holds NaN or Inf; if it holds several variables
-        and none is chosen, or no such variable or channel; if no sampling rate is known, or `file_fs` is another than
-        the file's; if the file states a rate below 300 Hz and neither `fs` nor `file_fs` confirms it; if the rates are in
-        no ratio of whole numbers; if a scale comes without its unit; if `unit` is another than the file's.
+        If the file is empty, cut short, damaged, claims more than it has, or holds NaN or Inf; if it holds several
+        variables and none is chosen, or no such variable or channel; if no sampling rate is known, or `file_fs` is
+        another than the file's; if the file states a rate below 300 Hz and neither `fs` nor `file_fs` confirms it; if
+        the rates are in no ratio of whole numbers; if a scale comes without its unit; if `unit` is another than the
+        file's.
 
     See Also
     --------
@@ -279,13 +282,14 @@ def calibration_factor(
 ) -> float:
     """Return the pascals that the number 1 of a recording stands for, from a recording of a sound calibrator.
 
-    The rms of the tone becomes ``20e-6 * 10**(level_db / 20)`` Pa: 1.002 Pa at 94 dB. Hum and noise beside the tone do not
-    count.
+    The rms of the tone becomes ``20e-6 * 10**(level_db / 20)`` Pa: 1.002 Pa at 94 dB. Hum and noise beside the tone do
+    not count.
 
     Parameters
     ----------
     calibrator : path or Recording
-        The calibrator's tone, at least 0.5 s of it and nothing else, recorded with the gain of the recordings to be scaled.
+        The calibrator's tone, at least 0.5 s of it and nothing else, recorded with the gain of the recordings to be
+        scaled.
     level_db : float, default 94.0
         Its sound pressure level in dB re 20 uPa; IEC 60942 prefers 94 dB and 114 dB.
     channel : int, optional
@@ -299,8 +303,8 @@ def calibration_factor(
     Raises
     ------
     ValueError, TypeError
-        If the recording has several channels and none is chosen, is shorter than 0.5 s or silent, has a unit already, if
-        less than 90 % of its power is one tone, or its level drifts by more than 0.5 dB.
+        If the recording has several channels and none is chosen, is shorter than 0.5 s or silent, has a unit already,
+        if less than 90 % of its power is one tone, or its level drifts by more than 0.5 dB.
 
     Examples
     --------

@@ -41,7 +41,7 @@ _QUOTED = re.compile(r'"\s*([^"]*)"')
 
 
 class Table(NamedTuple):
-    """Columns of numbers, (n_rows, n_columns), the lines above them that are not blank, and the columns' headings if any."""
+    """Columns of numbers, (n_rows, n_columns), the lines above them, and the columns' headings if any."""
 
     header: list[str]
     columns: np.ndarray
@@ -49,7 +49,7 @@ class Table(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Which line is the first with numbers, what separates them, whether decimals follow a comma, and the first column is empty."""
+    """Which line is the first with numbers, what separates them, and how they are written."""
 
     first: int
     delimiter: str | None

@@ -97,26 +97,26 @@ def assess(
     """Return the verdict on an amplifier: whether it buys a noise reduction, what limits, and what to change.
 
     With I references, J loudspeakers and K error microphones, noise reductions are those of all microphones together:
-    energies are summed over the microphones before the ratio is taken. Each loudspeaker has its own rated power, and the
-    amplifiers are enough if all of them together are. The offsets of the recordings are subtracted, because no
+    energies are summed over the microphones before the ratio is taken. Each loudspeaker has its own rated power, and
+    the amplifiers are enough if all of them together are. The offsets of the recordings are subtracted, because no
     loudspeaker plays them.
 
     Parameters
     ----------
     noise : array_like, shape (n_samples,) or (I, n_samples)
-        Recording of the reference microphones, with silent loudspeakers; if there are none, of the error microphones (see
-        `feedback`). A `Recording` must have the plant's sample rate.
+        Recording of the reference microphones, with silent loudspeakers; if there are none, of the error microphones
+        (see `feedback`). A `Recording` must have the plant's sample rate.
     plant : Plant
         Paths from each reference and from each control signal to each error microphone. The primary path may be missing
         if there is a `disturbance`, or no reference microphone. The amplifiers are those of the `rating`.
     rating : float, AmplifierRating, LoudspeakerRating, or a sequence of them
-        What the amplifier and the loudspeaker bear; a number is a rated power in squared units of the control signal. With
-        several loudspeakers one rating for all, or a sequence with an entry for each: a rating, or a sequence of ratings
-        that hold together.
+        What the amplifier and the loudspeaker bear; a number is a rated power in squared units of the control signal.
+        With several loudspeakers one rating for all, or a sequence with an entry for each: a rating, or a sequence of
+        ratings that hold together.
     disturbance : array_like, shape (n_samples,) or (K, n_samples), optional
         Recording of the error microphones, made together with `noise`. It contains what the reference does not explain,
-        so that the coherence can be checked, and is compared with what the primary path gives, if there is one. By default
-        it is computed by the primary path.
+        so that the coherence can be checked, and is compared with what the primary path gives, if there is one. By
+        default it is computed by the primary path.
     want_db : float, default 6
         Noise reduction wanted in dB.
     algorithm : str, default "KF-PB"
@@ -135,17 +135,17 @@ def assess(
         How far the true secondary path may differ from the plant's, for KF-PB, which learns the path as it controls:
         a relative error, by default 0.3, or what `paths.path_uncertainty` takes. None: it is exact.
     pascal_per_unit : float or array_like, shape (K,), optional
-        Sound pressure at the error microphone in Pa for a value of 1, of all microphones or of each. With it, sound levels
-        are computed.
+        Sound pressure at the error microphone in Pa for a value of 1, of all microphones or of each. With it, sound
+        levels are computed.
     switch_on_s : float, optional
         Time in s at which the control is switched on; by default 0.5 s, or a tenth of a shorter record.
     feedback : bool, default False
-        Whether the controllers also predict the disturbance from its past (hybrid control, see `with_internal_model`). If
-        there is neither a primary path nor a `disturbance`, there is no reference microphone, as in headphones, and `noise` is
-        the disturbance.
+        Whether the controllers also predict the disturbance from its past (hybrid control, see `with_internal_model`).
+        If there is neither a primary path nor a `disturbance`, there is no reference microphone, as in headphones, and
+        `noise` is the disturbance.
     bar : tqdm bar, optional
-        Bar that advances with the samples that are run, those on which settings are tried included; its total is set, and it
-        is described by what is going on.
+        Bar that advances with the samples that are run, those on which settings are tried included; its total is set,
+        and it is described by what is going on.
 
     Returns
     -------
@@ -155,15 +155,15 @@ def assess(
     Raises
     ------
     TypeError, ValueError
-        Signals that are not finite, silent, too short for the filter or for a run of 2 s, or of different lengths; paths
-        whose channels do not fit the signals; neither a primary path nor a disturbance without `feedback`; a settled
-        feedback loop without a margin, with the secondary path or one that was measured again; a rating that does
-        not limit the mean power, or ratings for another number of loudspeakers; an unknown algorithm.
+        Signals that are not finite, silent, too short for the filter or for a run of 2 s, or of different lengths;
+        paths whose channels do not fit the signals; neither a primary path nor a disturbance without `feedback`; a
+        settled feedback loop without a margin, with the secondary path or one that was measured again; a rating that
+        does not limit the mean power, or ratings for another number of loudspeakers; an unknown algorithm.
 
     Notes
     -----
-    The cause is the first ceiling that does not reach `want_db`; see `Ceilings`. If all of them do and the run does not,
-    the amplifier is the cause if a run with more power reaches it (peaks and short windows cost more than the mean
+    The cause is the first ceiling that does not reach `want_db`; see `Ceilings`. If all of them do and the run does
+    not, the amplifier is the cause if a run with more power reaches it (peaks and short windows cost more than the mean
     power), otherwise the adaptation is.
 
     The least rated power is found by bisection: the run is repeated with other ratings, about six times. They do not
@@ -172,13 +172,13 @@ def assess(
     The algorithms run side by side, on as many cores as there are. The numerical libraries get one thread
     meanwhile: with filters of this size, more of them slow each other down.
 
-    With `feedback`, the disturbance one sample late is a reference, for the ceilings too: they are those of predictors, and
-    there is no coherence. `paths.internal_model_margin` judges the settled loop with the plant's path and with any measured ones
-    in `secondary_path_uncertainty`; the least margin counts.
+    With `feedback`, the disturbance one sample late is a reference, for the ceilings too: they are those of predictors,
+    and there is no coherence. `paths.internal_model_margin` judges the settled loop with the plant's path and with any
+    measured ones in `secondary_path_uncertainty`; the least margin counts.
 
-    With several loudspeakers the required rated powers are in the proportions of the ratings. The coherence is the multiple
-    coherence of all references. The causality margin is that of each microphone's earliest loudspeaker, at the worst
-    microphone.
+    With several loudspeakers the required rated powers are in the proportions of the ratings. The coherence is the
+    multiple coherence of all references. The causality margin is that of each microphone's earliest loudspeaker, at the
+    worst microphone.
 
     Examples
     --------
@@ -335,8 +335,8 @@ def recorded_signals(
     """Return references, disturbances and secondary paths, checked, the recordings without their offsets.
 
     With `feedback`, the disturbances one sample late are the last references, or the only ones if there is neither a
-    primary path nor a `disturbance`: `noise` is then the disturbance. With one channel of each kind, there are no channel
-    axes.
+    primary path nor a `disturbance`: `noise` is then the disturbance. With one channel of each kind, there are no
+    channel axes.
     """
     x, s = _recording(noise, "noise", plant.fs), plant.secondary
     K, J, _ = s.shape

@@ -131,7 +131,8 @@ class Assessment:
     algorithm : str
         The controller that the verdict is on.
     limits : OutputLimits or ChannelLimits
-        What the rating allows the control signal; with several channels a tuple `each` of them, one for each loudspeaker.
+        What the rating allows the control signal; with several channels a tuple `each` of them, one for each
+        loudspeaker.
     ceilings : Ceilings
         Noise reductions that nothing can surpass, one after the other.
     bound_db : float
@@ -160,8 +161,8 @@ class Assessment:
     runs : dict of str to SimulationResult
         Run of each algorithm, from the moment it is switched on.
     curve : tuple of ndarray
-        Rated powers, and the noise reduction in dB that is the bound for each. With several loudspeakers multiples of all
-        ratings.
+        Rated powers, and the noise reduction in dB that is the bound for each. With several loudspeakers multiples of
+        all ratings.
     volts_per_unit, ohm : float, ndarray of shape (J,), or None
         Scale of the control signal and impedance, if a rating has them.
     fs : float
@@ -180,8 +181,8 @@ class Assessment:
     loop : FeedbackMargin or None
         Stability of the settled loop of a feedback or hybrid controller; None otherwise, or if the run diverged.
     timing_fault : str or None
-        What is wrong with the timing of the recordings (clocks that differ, lost samples, swapped files), if coherence or
-        causality limits and they show it.
+        What is wrong with the timing of the recordings (clocks that differ, lost samples, swapped files), if coherence
+        or causality limits and they show it.
     origin : dict of str to str
         What the page says of where it comes from: the command, and each file.
     """

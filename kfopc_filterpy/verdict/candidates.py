@@ -17,8 +17,8 @@ from kfopc_filterpy.bounds import SuggestedSettings
 
 from .limits import ChannelLimits, Limits, each_of
 
-# Step sizes over the taps and the power of the filtered reference. From twice the largest on, gradient descent diverges on
-# any noise; with the smallest it learns for some 10^4 samples per tap.
+# Step sizes over the taps and the power of the filtered reference. From twice the largest on, gradient descent diverges
+# on any noise; with the smallest it learns for some 10^4 samples per tap.
 STEP_SIZES = tuple((2.0 ** np.arange(-14.0, 0.0)).tolist())
 # r E[x'^2]/q: the filter forgets over about its inverse square root in samples. The diagonal filter learns as slowly as
 # NLMS, and needs less state noise than the full one, whose best is at 1e-8 to 1e-4.

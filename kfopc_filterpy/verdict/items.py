@@ -157,7 +157,7 @@ class Sound:
             raise ValueError(f"from_s must be a time in s from 0 on, got {self.from_s}")
 
     def excerpt(self, signal: np.ndarray, fs: float) -> np.ndarray:
-        """Return the part of a signal, of `fs` samples per second, that the page plays: 4 s, or what there is of them."""
+        """Return the part of a signal at a rate `fs` that the page plays: 4 s, or what there is of them."""
         first = round(self.from_s * fs)
         return signal[first : first + round(EXCERPT_S * fs)]
 

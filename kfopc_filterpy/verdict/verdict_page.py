@@ -104,7 +104,10 @@ def _run_figures(verdict: Assessment) -> Iterator[FigureItem]:
 
 
 def _one_below_another(count: int, what: str, size: tuple[float, float], draw: Callable[[int, Any], None]) -> Figure:
-    """Return a figure of axes drawn one below another; if there are several, each label begins with `what` and a number."""
+    """Return a figure of axes drawn one below another.
+
+    If there are several, each label begins with `what` and a number.
+    """
     import matplotlib.pyplot as plt
 
     height = size[1] * (1.0 if count == 1 else 0.8 * count)
