@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from functools import partial
 
 from .._validate import as_choice, as_nonnegative, as_number
+from .amplifiers import cheapest_enough
 from .inputs import Files, calibration_of, ratings_of, scene_of, uncertainty_of
 from .options import DONE, Parser, add_command, add_count, add_number, add_output, add_recorded_scene, prepare_output
 from .printing import progress_bar, say_written, tell
@@ -19,6 +21,7 @@ EXAMPLES = """examples:
   kfopc verdict stereo.wav:0 --disturbance stereo.wav:1 --secondary paths.mat:S --rated-power 1.6
   kfopc verdict ear.wav --feedback --secondary S.wav --watt 0.1 --ohm 32 --volts-per-unit 1.8
   kfopc verdict outside.wav --disturbance ear.wav --feedback --secondary S.wav --watt 0.1 --ohm 32 --volts-per-unit 1.8
+  kfopc verdict noise.wav --primary P.wav --secondary S.wav --amplifiers list.csv --volts-per-unit 10
   cat noise.wav | kfopc verdict - --primary P.wav --secondary S.wav --rated-power 1.6
   kfopc verdict noise.wav --disturbance errors.wav --secondary S1.wav --secondary S2.wav --watt 20 --watt 10 --ohm 8
 
@@ -43,6 +46,11 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     )
     parser.add_argument("--feedback", action="store_true", help=about)
     add_number(parser, "--want-db", "dB", as_nonnegative, default=6.0, help="noise reduction wanted (default: 6)")
+    about = (
+        "list with the columns name, watt, ohm and price, in place of --watt and --ohm: print a table, the cheapest that is "
+        "enough first; the verdict is on that one"
+    )
+    parser.add_argument("--amplifiers", metavar="CSV", help=about)
     about = "algorithm of the verdict, behind a limiter (default: KF-PB); KF-PB, KF-OPC and FxLMS run beside it"
     parser.add_argument("--algorithm", default="KF-PB", help=about)
     about = (
@@ -84,10 +92,10 @@ def verdict(options: argparse.Namespace) -> int:
     files = Files(options)
     noise, plant, disturbance = scene_of(options, files)
     with progress_bar(options, "sample") as bar:
-        found = assess(
+        assessed = partial(
+            assess,
             noise,
             plant,
-            rating=ratings_of(options, plant.n_loudspeakers),
             disturbance=disturbance,
             want_db=options.want_db,
             algorithm=options.algorithm,
@@ -99,12 +107,18 @@ def verdict(options: argparse.Namespace) -> int:
             feedback=options.feedback,
             bar=bar,
         )
+        table = None
+        if options.amplifiers is None:
+            found = assessed(rating=ratings_of(options, plant.n_loudspeakers))
+        else:
+            found, table = cheapest_enough(options, plant.n_loudspeakers, lambda rating: assessed(rating=rating))
         advice = advice_on(found, fs="--fs ", n_taps="--taps ")
         origin = {"Command": options.command, "Files": "; ".join(files.read)}
+        if table:
+            origin["Amplifiers"] = "; ".join(f"{row[0]}: enough {row[-2]}, {row[-1]} dB to spare" for row in table.rows)
         found = replace(found, advice=tuple(advice), notes=(*found.notes, *files.remarks), origin=origin)
-    text = str(found)
-    if options.all:
-        text = "\n".join([text, "", *algorithms_table(found).lines])
+    tables = ([table] if table else []) + ([algorithms_table(found)] if options.all else [])
+    text = "\n".join([str(found), *(line for one in tables for line in ("", *one.lines))])
     tell(options, found.json if options.json else text, found.notes)
     if options.output is not None:
         say_written(options, found.write(options.output), "verdict.json")

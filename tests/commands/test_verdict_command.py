@@ -84,6 +84,50 @@ def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(inside, cap
     )
 
 
+def test_of_a_list_of_amplifiers_the_cheapest_that_is_enough_is_first(command, folder):
+    rows = ["Big;1,0;8;250", "Small;0,001;8;9,5", "Other load;0,04;4;80", "Middle;0,02;8;45"]
+    (folder / "list.csv").write_text("\n".join(["Name;Watt;Ohm;Price (EUR)", *rows, ""]))
+    scene = [*SCENE, "--taps", "32", "--volts-per-unit", "1", "--quiet"]
+    code, out, _ = command("verdict", *scene, "--amplifiers", "list.csv", "--json")
+    data = json.loads(out)
+    told = [text.split(": enough ") for text in data["origin"]["Amplifiers"].split("; ")]
+    alone = {}  # what each verdict on one of them says
+    for row in rows:
+        name, watt, ohm, _ = row.replace(",", ".").split(";")
+        alone[name] = "no" if command("verdict", *scene, "--watt", watt, "--ohm", ohm)[0] else "yes"
+    assert {name: answer.split(",")[0] for name, answer in told} == alone
+    by_price = ["Small", "Middle", "Other load", "Big"]
+    assert [name for name, _ in told] == sorted(by_price, key=lambda name: alone[name] == "no")
+    assert set(alone.values()) == {"yes", "no"}
+    first = told[0][0]
+    assert (code, data["enough"], data["rating"]["rated_power"]) == (
+        0,
+        True,
+        {"Middle": 0.16, "Other load": 0.16, "Big": 8.0}[first],
+    )
+    assert "Amplifier" in command("verdict", *scene, "--amplifiers", "list.csv")[1]
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "message"),
+    [
+        ("name,watt,price\na,1,1\n", [], "list.csv must begin with the headings name, watt, ohm, price, got"),
+        ("name,watt,ohm,price\na,1,8,?\n", [], "list.csv, line 2: watt, ohm and price must be numbers, got"),
+        ("name,watt,ohm,price\n", [], "list.csv lists no amplifier"),
+        (
+            "name,watt,ohm,price\na,1,8,1\n",
+            ["--watt", "20"],
+            "--watt would not be used: --amplifiers has a column for it",
+        ),
+    ],
+)
+def test_a_list_of_amplifiers_that_is_wrong_is_refused(command, folder, text, more, message):
+    (folder / "list.csv").write_text(text)
+    code, _, err = command("verdict", *SCENE, "--amplifiers", "list.csv", *more)
+    assert code == 2
+    assert message in err
+
+
 def test_a_process_ends_with_1_if_it_is_not(folder):
     ended = process(folder, "verdict", *SCENE, "--rated-power", "0.05", "--taps", "32", "--json", "--quiet")
     assert ended.returncode == 1, ended.stderr
