@@ -423,6 +423,7 @@ class Rated(Twins):
     ) -> None:
         """None: one loudspeaker, whose rated power is a number."""
         self.loudspeakers, references, taps = loudspeakers or 1, filters[0] if loudspeakers else 1, filters[1]
+        self.listed = loudspeakers is not None
         self.unheard, self.references = min(unheard, self.loudspeakers), references
         rated = np.array([0.5, 2.0])[: self.loudspeakers]
         each = [OutputPowerConstraint(power, fs=FS, memory_s=MEMORY_S) for power in rated]
@@ -459,7 +460,10 @@ class Rated(Twins):
             super().measure(method, z, *before, **arguments)
             return
         given = self.reference(may_lack=self.rng.random() < 0.3) if given is None else given
-        getattr(self.ours, method)(*before, *copy.deepcopy([z]), **copy.deepcopy(arguments), **given)
+        own = copy.deepcopy(z)
+        getattr(self.ours, method)(*before, own, **copy.deepcopy(arguments), **given)
+        if isinstance(own, np.ndarray):
+            own[...] = 7.0  # the filter has a copy
         factor = self.ours.constraint_factor
         if self.powers is None:
             assert factor == self.unconstrained_factor
@@ -500,11 +504,13 @@ class Rated(Twins):
             self.powers = None
             assert self.ours.rated_power is self.ours.constraint is None
         elif name == "rated_power":
-            self.ours.rated_power = value
+            of_each = self.listed and value > 1.0
+            rated = value * np.array([1.0, 2.0 if of_each else 1.0])[: self.loudspeakers]
+            self.ours.rated_power = rated if of_each else value
             if self.powers is None:
-                self.powers = Powers(np.full(self.loudspeakers, value))
-            for one in self.powers.each:
-                one.rated_power = value
+                self.powers = Powers(rated)
+            for one, power in zip(self.powers.each, rated, strict=True):
+                one.rated_power = power
         elif self.powers is not None:
             setattr(self.ours, name, value)
             self.powers.supplied = {key: own for key, own in self.powers.supplied.items() if key != name}
@@ -544,7 +550,7 @@ class Rated(Twins):
 
 
 class RatedWalk(Rated, RandomWalk):
-    loudspeakers, references, unheard = 1, 1, 0
+    loudspeakers, references, unheard, listed = 1, 1, 0, False
 
     @initialize(n=st.integers(1, 9), x_ndim=st.integers(1, 2), seed=seeds)
     def start(self, n: int, x_ndim: int, seed: int) -> None:

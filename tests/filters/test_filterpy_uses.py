@@ -195,6 +195,7 @@ def test_the_smoother_takes_gaps_and_the_inputs_that_filterpys_leaves_out() -> N
     kf = KFOPC(2, 2, 1)
     kf.F, kf.B, kf.H, kf.Q, kf.R = F, B, H, np.diag([0.1, 0.2]), np.diag([0.5, 0.4])
     means, covariances, _, _ = kf.batch_filter(z, us=us)
+    means.flags.writeable = covariances.flags.writeable = False
     smoothed, P, _, _ = kf.rts_smoother(means, covariances, us=us)
     # x(0) = F x0 + B u(0) + w with x0 ~ (0, I); x(k) = F x(k-1) + B u(k) + w; z = H x + v
     start = np.linalg.cholesky(np.linalg.inv(F @ F.T + kf.Q)).T
@@ -216,6 +217,11 @@ def test_the_smoother_takes_gaps_and_the_inputs_that_filterpys_leaves_out() -> N
     kf.B = None
     with_zero = kf.rts_smoother(means, covariances, us=[0.0 * u if k == 2 else u for k, u in enumerate(us)], Bs=[B] * n)
     np.testing.assert_allclose(kf.rts_smoother(means, covariances, **given)[0], with_zero[0], rtol=1e-12)
+    still = KFOPC(2, 2, 1)
+    still.B = B
+    still.predict_steadystate()
+    still.predict(u=np.zeros((1, 1)))
+    still.rts_smoother(means, covariances)  # no input moved this filter
 
 
 def test_it_is_a_filterpy_filter_with_its_signature_and_its_repr() -> None:
