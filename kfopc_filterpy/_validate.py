@@ -108,7 +108,11 @@ def as_number(value: Any, name: str, *, unit: str = "") -> float:
     if isinstance(value, float) and math.isfinite(value):  # fast path, for numpy's floats too: called for every sample
         return float(value)
     unit = f" in {unit}" if unit else ""
-    if value is None or isinstance(value, str | bytes) or (np.ndim(value) != 0 and np.size(value) != 1):
+    if (
+        value is None
+        or isinstance(value, str | bytes | bool | np.bool_)
+        or (np.ndim(value) != 0 and np.size(value) != 1)
+    ):
         raise TypeError(f"{name} must be a single number{unit}, got {value!r}")
     try:
         number = float(as_real_array(value, name).reshape(()))
@@ -175,7 +179,7 @@ def as_nonnegative(value: Any, name: str, *, unit: str = "") -> float:
 def as_count(value: Any, name: str, *, minimum: int = 1) -> int:
     """Return `value` as an int of at least `minimum`."""
     try:
-        count = operator.index(value)
+        count = operator.index(None if isinstance(value, bool) else value)  # True is no 1
     except TypeError as error:
         raise TypeError(f"{name} must be a whole number, got {value!r}") from error
     if count < minimum:

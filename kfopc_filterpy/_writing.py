@@ -19,19 +19,31 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+LONGEST_NAME = 200  # bytes: file systems take 255, and ours is longer by 23
 ABANDONED_S = 3600.0  # what is unfinished and as old as this belongs to a process that was killed
 
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Yield a file beside `path`. It takes that name when the block ends; if the block raises, it is removed."""
+    """Yield a file beside `path`. It takes that name when the block ends; if the block raises, it is removed.
+
+    What is there and is no file, such as a pipe, stays what it is: it gets the bytes.
+    """
     place = Path(os.path.realpath(path))  # a link stays a link
     if not place.parent.is_dir():
         raise FileNotFoundError(f"the folder {place.parent} does not exist: make it first")
     if place.is_dir():
         raise IsADirectoryError(f"{path} is a folder: name a file in it")
-    _remove_abandoned(place.parent, place.name)
-    part = place.with_name(f".{place.name}.{os.urandom(8).hex()}.part")
+    if place.exists() and not place.is_file():
+        with tempfile.TemporaryFile() as made:
+            yield made
+            made.seek(0)
+            with open(place, "wb") as to:
+                shutil.copyfileobj(made, to)
+        return
+    short = place.name.encode()[:LONGEST_NAME].decode(errors="ignore")
+    _remove_abandoned(place.parent, short)
+    part = place.with_name(f".{short}.{os.urandom(8).hex()}.part")
     try:
         with open(part, "xb") as file:
             yield file

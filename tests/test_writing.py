@@ -188,3 +188,27 @@ def test_an_interrupted_verdict_leaves_the_folder_as_it_was(renames, tmp_path):
     assert done.returncode == 130, done
     assert done.stderr.endswith("kfopc: interrupted; each file is as it was, or was written whole\n")
     assert contents(tmp_path) == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")
+def test_what_is_no_file_stays_what_it_is(tmp_path: Path) -> None:
+    pipe = tmp_path / "S.wav"
+    os.mkfifo(pipe)
+    with subprocess.Popen(["cat", str(pipe)], stdout=subprocess.PIPE) as reader:
+        write_wav(pipe, np.ones(500), FS)
+        got = reader.communicate()[0]
+    assert pipe.is_fifo()
+    write_wav(tmp_path / "file.wav", np.ones(500), FS)
+    assert got == (tmp_path / "file.wav").read_bytes()
+    if Path("/dev/full").exists():
+        link = tmp_path / "full.wav"
+        link.symlink_to("/dev/full")
+        with pytest.raises(OSError, match="No space"):
+            write_wav(link, np.ones(500), FS)
+        assert Path("/dev/full").is_char_device()
+
+
+def test_a_name_may_be_as_long_as_the_system_lets_it(tmp_path: Path) -> None:
+    name = 120 * "ä" + ".wav"  # 244 bytes
+    write_wav(tmp_path / name, np.ones(500), FS)
+    assert [path.name for path in tmp_path.iterdir()] == [name]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
+import signal
 import subprocess
 import tempfile
 import time
@@ -17,6 +19,7 @@ import numpy as np
 from .tasks import Task
 
 TIMEOUT_S = 120.0  # of a run
+MOST_SAID = 10_000  # bytes of complaints that are read
 FLOAT = np.dtype("<f8")
 
 
@@ -84,7 +87,11 @@ class CommandController(PlaysBlocks):
         self._complaints = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the command
         try:
             self._process = subprocess.Popen(
-                shlex.split(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._complaints
+                shlex.split(command),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._complaints,
+                start_new_session=True,  # what it starts ends with it
             )
         except OSError as error:
             self._complaints.close()
@@ -120,11 +127,11 @@ class CommandController(PlaysBlocks):
             if kind is None:
                 with suppress(OSError):
                     self._stdin.close()
-                if rest := self._stdout.read():
-                    raise EntryFailed(f"answered {len(rest)} bytes more than it was asked for")
+                if self._stdout.read(1):
+                    raise EntryFailed("answered more than it was asked for")
         finally:
             self._timer.cancel()
-            self._process.kill()
+            self._kill()
             self._process.wait()
             for file in (self._stdin, self._stdout, self._complaints):
                 with suppress(OSError):
@@ -142,7 +149,15 @@ class CommandController(PlaysBlocks):
 
     def _give_up(self) -> None:
         self._timed_out = True
-        self._process.kill()
+        self._kill()
+
+    def _kill(self) -> None:
+        """End the command and what it has started."""
+        if os.name == "nt":
+            self._process.kill()
+            return
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
 
     def _write(self, content: bytes) -> None:
         try:
@@ -159,6 +174,6 @@ class CommandController(PlaysBlocks):
             status = f"ended with status {self._process.wait(timeout=5.0)}"
         except subprocess.TimeoutExpired:
             status = "closed its output"
-        self._complaints.seek(0)
+        self._complaints.seek(max(self._complaints.seek(0, os.SEEK_END) - MOST_SAID, 0))
         lines = self._complaints.read().decode(errors="replace").strip().splitlines()
         return EntryFailed(f"{what} in block {self._blocks} and {status}" + (f": {lines[-1]}" if lines else ""))

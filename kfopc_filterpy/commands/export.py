@@ -107,6 +107,8 @@ def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | Non
 def _paths(given: Any, folder: Path, files: Files) -> Any:
     """Return secondary paths, (taps,) or (K, J, taps): as given, or from files beside the settings file."""
     names = [given] if isinstance(given, str) else given
+    if names == []:
+        raise ValueError("secondary must be taps or names of files, got an empty list")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return given
     matrix = files.matrix([str(folder / name) for name in names], "secondary")

@@ -13,6 +13,7 @@ from .._types import NumberOrArray, PerLoudspeaker
 from .._validate import as_count, as_nonnegative, as_positive, per_channel, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..core.block import REASONS, Algorithm, Block, InUse, Shape
+from ..core.calls import LONGEST_CALL
 from ..core.run_loop import REFUSED_REFERENCE, Steps, process
 from ..paths.uncertainty import Uncertainty, as_uncertainty, guard_filter
 from ..plant import Secondary
@@ -24,14 +25,9 @@ from .channels import Channels
 from .processing import BlockProcessing, RefusedUpdate, adapt_flags, block_signals, checked_block
 
 NO_SOLUTION = "the update has no solution: the covariance P is too large, S = x' P x' + q could overflow"
-OVERFLOW = (
-    "the disturbance estimate, the reference and the filtered reference must have finite squares, and one overflows: "
-    "nothing was changed; scale the signals, or use a smaller step"
-)
 # Settings that may be zero; the others must be positive.
 MAY_BE_ZERO = {"leak", "state_noise", "measurement_noise", "initial_variance", "regularization", "spread"}
 MAY_BE_ZERO |= {"penalty_factor", "modified"}
-LONGEST_CALL = 1600  # samples between two opportunities to interrupt a block: 0.1 s at 16 kHz
 # What a run records of each loudspeaker, by its name in the constraint's numbers.
 RECORDED = {"constraint_factor": "factor", "disturbance_power": "power", "secondary_path_gain": "gain"}
 
@@ -538,19 +534,25 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
             Whether to follow a sample; the others only enter the delay lines.
         """
         x, e = block_signals(self, references, errors)
-        taken = self._listen(x.T, e.T, adapt_flags(adapt, x.shape[-1]))
-        if taken < x.shape[-1]:
-            raise refused_while_listening(OVERFLOW, taken)
+        flags = adapt_flags(adapt, x.shape[-1])
+        with self.in_use:
+            states = [self._block.memory, *(array for one in self._each(self.constraint) for array in one.state)]
+            before = [array.copy() for array in states]
+            try:
+                self._listen(x.T, e.T, flags)
+            except BaseException:
+                for array, own in zip(states, before, strict=True):
+                    array[...] = own
+                raise
 
-    def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
+    def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> None:
         block = self._block
         x, e = (signal.reshape(len(signal), -1) for signal in (references, errors))
         for begin in range(0, len(x), LONGEST_CALL):
             part = slice(begin, begin + LONGEST_CALL)
             done, answer = block.listen(x[part], e[part], adapting[part])
             if answer:
-                raise refused_while_listening(REASONS[answer], begin + done)
-        return len(x)
+                raise refused_while_listening(f"{REASONS[answer]}; nothing was changed", begin + done)
 
     def looped(self) -> Looped | None:
         """Return what the core's loop needs to run this controller; None if Python must call the steps."""

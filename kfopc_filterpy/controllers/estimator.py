@@ -163,16 +163,14 @@ class KalmanController(CoreController):
             self.estimator.update(None)
         return y
 
-    def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
+    def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> None:
         if self.constraint is self._own_constraint:
-            return super()._listen(references, errors, adapting)
+            super()._listen(references, errors, adapting)
+            return
         block = self._block
         for n, e in enumerate(errors):
-            taken = super()._listen(references[n : n + 1], errors[n : n + 1], adapting[n : n + 1])
-            if not taken:
-                return n
+            super()._listen(references[n : n + 1], errors[n : n + 1], adapting[n : n + 1])
             if adapting[n]:
                 filtered = float(block.latest("filtered_reference").flat[0])
                 reference = float(block.latest("reference").flat[0])
                 self.constraint.advance(float(e), filtered, reference)  # silent: d^ = e
-        return len(references)

@@ -15,7 +15,7 @@ from .base import as_forgetting, calls_of, require_rates
 from .channel_samples import require_moderate
 from .channels import Channels
 from .making import controller_maker
-from .processing import BlockProcessing, checked_block
+from .processing import BlockProcessing, block_signals, checked_block
 
 RIDGE = 0.01  # of the mean power of all bins, added to that of each: the noise may leave bins empty
 SPREAD = 0.5  # a tenth is too little for tones in the middle of a bin; the edges of a band converge slower with more
@@ -163,6 +163,7 @@ class FrequencyDomainController(Channels, BlockProcessing, Checkpointed):
         self._blocks += 1
         share = max(1.0 - (self.forgetting or 0.0), 1.0 / self._blocks)
         self._powers += share * (np.sum(np.abs(self._X_filtered[..., 0, :]) ** 2, axis=(0, 1, 2)) - self._powers)
+        self._powers[self._powers < TINY] = 0.0  # denormal numbers are slow
         heard, lengths = self._heard(), self.block_size / self.n_taps
         self._age = self._age + 1 if self._W.any() else 0
         rise = RISE * lengths if self._age * lengths < YOUNG else lengths / HELD
@@ -309,6 +310,7 @@ class FrequencyDomainController(Channels, BlockProcessing, Checkpointed):
         errors : ndarray, shape (n_samples,) or (K, n_samples)
             Signals of the error microphones.
         """
+        require_moderate(block_signals(self, references, errors)[0], "reference")
         self.process(references, errors, adapt=False)
 
     def require_sample_rate(self, fs: float) -> None:

@@ -2,14 +2,6 @@
  * factor alpha. */
 #include "signals.h"
 
-/* Below the smallest normal number, a ratio of powers has no digits left: such a signal counts as
- * silent. */
-#ifdef ANC_FLOAT
-static const real SILENCE = FLT_MIN;
-#else
-static const real SILENCE = DBL_MIN;
-#endif
-
 /* Return the mean square with one more square in it: of all until the memory is full, then of the
  * window, or exponential if the length is 0. */
 static real next_mean(const anc_power *p, const real *window, int32_t length, real rate,
@@ -18,7 +10,7 @@ static real next_mean(const anc_power *p, const real *window, int32_t length, re
     const real taken = p->taken + 1;
     if (!length) {
         const real share = rate * taken < 1 ? 1 / taken : rate;
-        return p->mean_square + share * (square - p->mean_square);
+        return flushed(p->mean_square + share * (square - p->mean_square));
     }
     /* The sum over this lap, and the rest of the last lap: no difference, whose rounding would
      * stay. */
@@ -42,15 +34,16 @@ void anc_preview(const anc_constraint *c, const anc_power *powers, const real *w
                             ? next_mean(powers + i, lap, length, c->rate, next->square[i])
                             : powers[i].mean_square;
     }
+    /* Below SMALLEST, a ratio of powers has no digits left: such a signal counts as silent. */
     const real d2 = next->mean[ANC_DISTURBANCE], x2 = next->mean[ANC_REFERENCE];
     /* G_s = E[x'^2] / E[x^2] (eq. 11), or the last one while the reference is silent */
     next->gain = c->gain;
-    if (x2 > SILENCE) next->gain = next->mean[ANC_FILTERED] / x2;
+    if (x2 > SMALLEST) next->gain = next->mean[ANC_FILTERED] / x2;
     if (!isnan(c->supplied_gain)) next->gain = c->supplied_gain;
     next->power = isnan(c->supplied_power) ? d2 : c->supplied_power;
     /* alpha = min(sqrt(rho_o G_s / delta_d^2), 1) (eq. 13); 1 without a disturbance or a gain */
     next->factor = 1;
-    if (next->power > SILENCE && !isnan(next->gain))
+    if (next->power > SMALLEST && !isnan(next->gain))
         next->factor = smaller(root(c->rated_power * next->gain / next->power), 1);
     if (!isnan(c->supplied_factor)) next->factor = c->supplied_factor;
 }
@@ -62,8 +55,10 @@ static void take_into_window(anc_power *p, real *lap, int32_t length, real squar
     const int32_t at = (int32_t)p->position;
     p->lap += square;
     lap[at] = square;
-    p->position = (real)(at + 1);
-    if (at + 1 < length) return;
+    if (at + 1 < length) {
+        p->position = (real)(at + 1);
+        return;
+    }
     p->lap = 0;
     p->position = 0;
     for (int32_t k = length - 2; k >= 0; k--) lap[k] += lap[k + 1];

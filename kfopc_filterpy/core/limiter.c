@@ -91,8 +91,10 @@ real anc_limit(anc_limiter *c, real *laps, real u)
     c->spent += square_of(c, y);
     r.out[i] = -c->spent;
     r.square[i] = square_of(c, y);
-    c->position = (real)(i + 1);
-    if (i + 1 == N) start_lap(c, r, N);
+    if (i + 1 < N)
+        c->position = (real)(i + 1);
+    else
+        start_lap(c, r, N);
     return y;
 }
 

@@ -110,7 +110,7 @@ static int update_fxnlms(anc_view *view, const real *error)
     *f->over = epsilon > 0 ? epsilon + energy : larger(energy, QUIET * usual);
     const int refused = update(view, error, fxnlms_step);
     if (refused) return refused;
-    *f->usual = held_value(usual, energy, 1 - slow, 1 + RISE / L);
+    *f->usual = flushed(held_value(usual, energy, 1 - slow, 1 + RISE / L));
     if (heard == 0) return ANC_DONE; /* nothing is learned of silence */
     *f->learned = *f->age < YOUNG * L ? larger(*f->learned, heard)
                                       : held_value(*f->learned, heard, 1 - slow, 1 + slow);

@@ -405,7 +405,7 @@ static void step_weights(const signals *s, const real *error, int32_t sj, int32_
     for (int32_t k = 0; s->G && k < s->K; k++)
         add_scaled(w, -step.mu * heard[k], newest(&s->guarded, k * rows + ji), s->L);
     if (step.keep != 1 || step.penalty != 0)
-        for (int32_t l = 0; l < s->L; l++) w[l] = step.keep * w[l] - step.penalty * x[l];
+        for (int32_t l = 0; l < s->L; l++) w[l] = flushed(step.keep * w[l] - step.penalty * x[l]);
     for (int32_t k = 0; k < s->K; k++)
         add_scaled(w, step.mu * e[k], newest(&s->filtered, k * rows + ji), s->L);
 }

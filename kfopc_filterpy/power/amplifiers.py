@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_positive, as_returned
-from ..core.calls import amplify_all
+from ..core.calls import amplify_all, in_parts
 from ..core.run_loop import HARD_CLIP, LINEAR, SOFT_SATURATION
 
 # The structure of the core, see anc.h.
@@ -39,7 +39,7 @@ class _Amplifier:
         """Return the output for `signal`, a number or an array of any shape."""
         array = np.asarray(signal, dtype=np.float64, order="C")
         model, out = self.model, np.empty(array.shape)
-        amplify_all(model.ctypes.data, array.ctypes.data, out.ctypes.data, array.size)
+        in_parts(amplify_all, (model.ctypes.data,), array, out)
         return out if array.ndim else float(out)
 
 

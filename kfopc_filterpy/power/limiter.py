@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_number, as_positive, as_signal
-from ..core.calls import limit, limit_all
+from ..core.calls import in_parts, limit, limit_all
 from ..core.library import constant
 
 DEFAULT_WINDOW_S = 0.1
@@ -174,7 +174,7 @@ class OutputLimiter:
         """Return the output (n,) for a `signal` (n,), or for its next piece; the same bits as sample by sample."""
         signal = as_signal(signal, "signal", min_length=0)
         out = np.empty(signal.size)
-        limit_all(*self._places(), signal.ctypes.data, out.ctypes.data, signal.size)
+        in_parts(limit_all, self._places(), signal, out)
         return out
 
     def _places(self) -> tuple[int, int]:

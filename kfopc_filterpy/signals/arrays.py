@@ -9,7 +9,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from .content import Content, chosen_variable, require_room
+from .content import Content, chosen_variable, require_few, require_room
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -44,6 +44,7 @@ def read_npz(path: str | os.PathLike[str], variable: str | None) -> Content:
             raise ValueError(
                 f"{path} is an archive without arrays: of a workbook (.xlsx, .ods), save the sheet as .csv"
             )
+        require_few(path, len(archive.infolist()))
         headers: dict[str, _Header] = {}
         for entry in archive.infolist():
             require_room(path, entry.file_size / 8)  # numpy would read a header of any length

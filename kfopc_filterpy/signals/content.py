@@ -17,6 +17,7 @@ _LEAST_ROOM = 64 * 2**20  # bytes of float64 samples that any file may hold
 NO_SIGNAL = 100  # rows: no signal rises for so long
 LEAST_SURE_RATE = 300.0  # Hz; kHz that stand for Hz, or ms for s, give less: recorders sample at up to 262 kHz
 _ROUNDED = 0.35  # share by which a step between times may differ: they are written with few digits
+MOST_VARIABLES, LISTED = 1000, 20  # that a file may hold; that a message names
 _SAME_RATE = 1e-3  # share by which a rate may differ that is stated twice
 # Rates of converters and analysers in Hz; of those that rounded times allow, one of these is likelier than another.
 _COMMON_RATES = np.array(
@@ -150,6 +151,14 @@ def even_step(times: np.ndarray) -> float | None:
     return float(step) if even else None
 
 
+def require_few(path: str | os.PathLike[str], n_variables: int) -> None:
+    """Raise ValueError if a file has more variables than any recording: each is compared with each."""
+    if n_variables > MOST_VARIABLES:
+        raise ValueError(
+            f"{path} holds {n_variables} variables, at most {MOST_VARIABLES} are read: save the signal in a file of its own"
+        )
+
+
 def chosen_variable(
     path: str | os.PathLike[str],
     shapes: Mapping[str, tuple[int, ...]],
@@ -161,6 +170,7 @@ def chosen_variable(
 
     `shapes` has the arrays of real numbers, `others` what the rest is.
     """
+    require_few(path, len(shapes) + len(others))
     name = _name_of(path, shapes, variable, others)
     require_room(path, math.prod(shapes[name]))
     samples = np.asarray(read(name))
@@ -223,7 +233,9 @@ def _name_of(
     variable: str | None,
     others: Mapping[str, str],
 ) -> str:
-    there = ", ".join([f"{name} {shape}" for name, shape in sorted(shapes.items())]) or "no array of real numbers"
+    listed = [f"{name} {shape}" for name, shape in sorted(shapes.items())]
+    more = f" and {len(listed) - LISTED} more" if len(listed) > LISTED else ""
+    there = ", ".join(listed[:LISTED]) + more or "no array of real numbers"
     if variable is None:
         names = [
             name

@@ -13,6 +13,7 @@ import numpy as np
 from .content import LEAST_SURE_RATE, NO_SIGNAL, Content, agreed_rate, even_step, rate_of_step, rounding_of
 
 _LONGEST_HEADER = 100  # lines
+_END, _ENOUGH = 4096, 20  # bytes and lines at the end by which a file that was cut is recognised
 _TEKTRONIX = re.compile(
     r'"?Record Length"?(,[^,]*){4}'
 )  # its header has three columns, beside those of times and samples
@@ -110,8 +111,10 @@ def _read_table(path: str | os.PathLike[str]) -> Table:
         heading = header[-1].strip() if header else ""
         if _is_decimal(path, heading, islice(_lines(path), layout.first, None)):
             layout = layout._replace(delimiter=None, has_decimal_comma=True)
-    # A "#" begins a comment at the start of a line only: "1.#INF" is no 1.
-    rows = (layout.plain(line) for line in islice(_lines(path), layout.first, None) if not line.startswith("#"))
+    _require_line_end(path, layout)
+    rows = (
+        layout.plain(line) for line in islice(_lines(path), layout.first, None) if not _is_comment(line, layout, path)
+    )
     try:
         columns = np.loadtxt(rows, delimiter=layout.delimiter, comments=None, ndmin=2)
     except ValueError as error:
@@ -165,6 +168,28 @@ def _are_numbers(line: str, delimiter: str | None) -> bool:
         return len([float(field) for field in line.strip().split(delimiter)]) > 0
     except ValueError:
         return False
+
+
+def _is_comment(line: str, layout: _Layout, path: str | os.PathLike[str]) -> bool:
+    """Return whether a "#" begins a line, and no numbers follow: "1.#INF" is no 1, and "#3" may be one."""
+    if not line.startswith("#"):
+        return False
+    if _are_numbers(layout.plain(line[1:]), layout.delimiter):
+        raise ValueError(f"{path} has the line {line.strip()!r} among its numbers: leave out the line, or the #")
+    return True
+
+
+def _require_line_end(path: str | os.PathLike[str], layout: _Layout) -> None:
+    """Raise ValueError if a file ends within its last number: without a line end, and shorter than all before."""
+    with open(path, "rb") as file:
+        file.seek(max(file.seek(0, os.SEEK_END) - _END, 0))
+        before, _, last = file.read().rpartition(b"\n")
+    lengths = [len(line.rstrip(b"\r")) for line in before.split(b"\n")[1:]]
+    if last.strip(b"\0 \r\t") and len(lengths) >= _ENOUGH and len(last) < min(lengths):
+        raise ValueError(
+            f"{path} ends within a line, {last.decode(errors='replace')!r}, which is shorter than those before: was it cut? If "
+            "it is complete, end it as a line"
+        )
 
 
 def _is_decimal(path: str | os.PathLike[str], names: str, lines: Iterator[str]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
 from dataclasses import replace
@@ -205,13 +206,36 @@ HEAD = "import sys\nread, write = sys.stdin.buffer.read, sys.stdout.buffer.write
         (HEAD + "read(256), write(bytes(64))", "answered 64 of 128 bytes in block 0 and ended with status 0"),
         (HEAD + "read(256), write(b'\\xff' * 128), sys.stdout.flush(), read()", "answered NaN or Inf in block 0"),
         (HEAD + "read()", "took longer than 0.5 s for a run"),
-        (HEAD + "while read(256): write(bytes(128)), sys.stdout.flush()\nwrite(b'more')", "answered 4 bytes more"),
+        (
+            HEAD + "while read(256): write(bytes(128)), sys.stdout.flush()\nwrite(b'more')",
+            "answered more than it was asked for",
+        ),
     ],
 )
 def test_a_command_that_fails_says_why(short: Task, tmp_path: Path, text: str, says: str) -> None:
     limit_s = 0.5 if "took" in says else 600.0
     with pytest.raises(EntryFailed, match=says), CommandController(short, command(tmp_path, text), limit_s) as entry:
         short.run(entry)
+
+
+def write_for_ever(descriptor: int) -> None:
+    while True:
+        os.write(descriptor, bytes(1 << 16))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no groups of processes")
+def test_what_a_command_has_started_ends_with_it(short: Task, tmp_path: Path) -> None:
+    """A grandchild reads from a pipe, to which nobody can write any more once it has ended."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    start = f"import subprocess\nsubprocess.Popen(['cat', {str(pipe)!r}], stdout=sys.stderr)\n"
+    with CommandController(short, command(tmp_path, start + HEAD), 600.0) as entry:
+        held = os.open(pipe, os.O_WRONLY)  # waits for the grandchild
+        with pytest.raises(EntryFailed):
+            short.run(entry)
+    with pytest.raises(BrokenPipeError):
+        write_for_ever(held)
+    os.close(held)
 
 
 @pytest.mark.parametrize(

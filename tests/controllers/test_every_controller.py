@@ -258,6 +258,24 @@ def test_bad_blocks_are_refused_before_anything_changes(name: str) -> None:
             assert content_of(controller) == before
 
 
+@pytest.mark.parametrize("bad", ["reference", "error"])
+@pytest.mark.parametrize(
+    "name", [n for n in ALL if hasattr(ALL[n](), "listen") and n not in ("LimitedController", *PYTHONS)]
+)
+def test_listening_to_a_bad_sample_changes_nothing(name: str, bad: str) -> None:
+    """Not even by the samples before it."""
+    controller = ALL[name]()
+    x, e = Room(controller).heard(slice(60))
+    if (x is None and bad == "reference") or (name in IN_BLOCKS and bad == "error"):
+        return  # what adapts in blocks takes no error while it listens
+    controller.process(x, e)
+    before, spoilt = content_of(controller), np.array(e if bad == "error" else x)
+    spoilt[..., 30] = 1e160
+    with pytest.raises(ValueError, match=r"loud|finite|overflow|at most"):
+        controller.listen(*((x, spoilt) if bad == "error" else (spoilt, e)))
+    assert content_of(controller) == before
+
+
 @pytest.mark.parametrize("name", [name for name in ALL if name not in ("LimitedController", *PYTHONS)])
 def test_a_refused_update_names_its_sample_and_the_rest_can_go_on(name: str) -> None:
     controller, steps = ALL[name](), ALL[name]()
