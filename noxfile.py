@@ -4,8 +4,8 @@
 # ///
 """Tasks: `nox -l` lists them, `nox -s docs` runs one. What follows `--` goes to pytest, Sphinx, the studies or cosmic-ray.
 
-`.ci/run` runs those marked with a star, `.ci/slow` runs bare, wheels, slow and fuzz; both install nox. Sessions that
-leave cores idle may run beside one another (`nox -j 2`).
+`.ci/run` runs those marked with a star, `.ci/slow` runs bare, wheels, slow, fuzz, kernels and prove; both install nox.
+Sessions that leave cores idle may run beside one another (`nox -j 2`).
 """
 
 from __future__ import annotations
@@ -191,6 +191,21 @@ def slow(session: nox.Session) -> None:
     session.run("python", "-m", "pytest", "-m", "slow", *(session.posargs or ["tests"]), env={"KFOPC_WHEELS": "dist"})
     session.install("--no-deps", "filterpy==1.4.5")
     session.run("python", "-m", "pytest", "-m", "slow", "-n0", "tests/filters/test_filterpy_own_tests.py")
+
+
+@nox.session(venv_backend="none", default=False)
+def kernels(session: nox.Session) -> None:
+    """Run README's tests with the kernels of an old processor, which sum in another order: no tolerance rests on one."""
+    run_readme(session, "pytest", OPENBLAS_CORETYPE="Nehalem", NPY_DISABLE_CPU_FEATURES="X86_V3 X86_V4")
+
+
+@nox.session(venv_backend="none", default=False)
+def prove(session: nox.Session) -> None:
+    """Prove what the C core promises with Frama-C, Why3 and Gappa; skipped if this machine lacks one of them."""
+    tools = ("frama-c", "why3", "z3", "cvc4", "gappa")
+    if missing := [tool for tool in tools if shutil.which(tool) is None]:
+        session.skip(f"not installed: {', '.join(missing)}")
+    session.run("python3", "tests/proofs/prove.py", external=True)
 
 
 @nox.session(default=False)

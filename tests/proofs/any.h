@@ -1,4 +1,5 @@
-/* Any bit pattern, NaN and infinities included; reading an `extern volatile double` would give finite values only. */
+/* Any bit pattern, NaN and infinities included; reading an `extern volatile double` would give
+ * finite values only. */
 #include "__fc_builtin.h"
 
 static double any(void)
