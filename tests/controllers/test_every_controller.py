@@ -108,18 +108,16 @@ def step(controller: Any, x: Any, e: Any, adapts: bool = True) -> Any:
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if name not in PYTHONS])
-@settings(max_examples=2)
-@given(cuts=st.lists(st.integers(1, 299), max_size=8), seed=st.integers(0, 100))
-def test_blocks_are_the_steps_bit_for_bit(name: str, cuts: list[int], seed: int) -> None:
+def test_blocks_are_the_steps_bit_for_bit(name: str) -> None:
     """However a recording is cut into blocks, and whichever samples are not adapted to."""
     blocks, steps = ALL[name](), ALL[name]()
     x, d = Room(blocks).heard(slice(300))
-    adapt = np.random.default_rng(seed).random(300) < 0.9
+    adapt = np.random.default_rng(1).random(300) < 0.9
     adapt[-1] = True  # what follows a sample that is left out is done with the next one
     expected = [step(steps, None if x is None else x[..., n], d[..., n], adapt[n]) for n in range(300)]
     got = [
         blocks.process(None if x is None else x[..., a:b], d[..., a:b], adapt=adapt[a:b])
-        for a, b in itertools.pairwise(sorted({0, *cuts, 300}))
+        for a, b in itertools.pairwise([0, 1, 2, 18, 82, 83, 300])
     ]
     np.testing.assert_array_equal(np.concatenate(got, axis=-1), np.transpose(expected))
     assert content_of(blocks) == content_of(steps)
