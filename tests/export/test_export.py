@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from copy import deepcopy
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,6 +44,7 @@ from kfopc_filterpy.controllers import CoreController, FeedbackNeutralizer, with
 from kfopc_filterpy.core.building import core_sources
 from kfopc_filterpy.export import Float32Controller, export_c
 
+FOLDER = Path(__file__).parent
 FS, L, RATED, WINDOW = 16000, 16, 0.5, 800
 TRAINING, SAMPLES = 3_000, 5_000
 S = np.array([0.0, 0.9, -0.4, 0.2, 0.1, 0.05])
@@ -393,48 +395,9 @@ def test_a_state_that_is_not_initialised_or_has_no_place_is_safe(name, tmp_path)
     ran(controller, slice(TRAINING))
     export_c(made("FxLMS"), tmp_path / "other.c")
     exported = export_c(controller, tmp_path / "anc.c")
-    main = tmp_path / "main.c"
-    call = "anc_control_signal(s, x, y)" if controller.multichannel else "y[0] = anc_control_signal(s, x[0])"
-    error = "e" if controller.multichannel else "e[0]"
-    main.write_text(f"""#include "anc.h"
-#include "other.h"
-#include <string.h>
-static anc_state states[4];
-static union {{ anc_state state; char bytes[sizeof(anc_state) + 1]; }} room;
-static double out[4][ANC_LOUDSPEAKERS];
-static int run(anc_state *s, double *y) /* what the last update returns */
-{{
-    int answer = 0;
-    for (int n = 0; n < 50; n++) {{
-        double x[ANC_REFERENCES], e[ANC_MICROPHONES];
-        for (int i = 0; i < ANC_REFERENCES; i++) x[i] = (n * 7 + i) % 5 - 2;
-        for (int k = 0; k < ANC_MICROPHONES; k++) e[k] = (n * 3 + k) % 7 - 3;
-        {call};
-        answer = anc_update(s, {error});
-    }}
-    return answer;
-}}
-int main(void)
-{{
-    int failed = 0;
-    anc_init(&states[0]);
-    memset(&states[2], 0xa5, sizeof *states);
-    other_init((other_state *)&states[3]); /* a smaller state */
-    for (int i = 0; i < 4; i++) {{
-        failed |= run(&states[i], out[i]) != ANC_ADAPTED;
-        failed |= memcmp(out[i], out[0], sizeof *out) || out[i][0] == 0;
-    }}
-    for (int i = 0; i < 2; i++) {{
-        anc_state *nowhere = i ? (anc_state *)(void *)(room.bytes + 1) : NULL;
-        anc_init(nowhere);
-        failed |= !anc_self_test(nowhere) || run(nowhere, out[1]) != ANC_NO_STATE || out[1][0] != 0;
-    }}
-    return failed;
-}}
-""")
-    succeeds(
-        *c_compiler(), "-std=c99", *FAST, main, exported.path, tmp_path / "other.c", "-lm", "-o", tmp_path / "main"
-    )
+    sources = [FOLDER / "any_state.c", exported.path, tmp_path / "other.c"]
+    arrays = ["-DARRAYS"] if controller.multichannel else []
+    succeeds(*c_compiler(), "-std=c99", *FAST, *arrays, "-I", tmp_path, *sources, "-lm", "-o", tmp_path / "main")
     succeeds(tmp_path / "main")
 
 
@@ -467,13 +430,6 @@ def test_the_example_in_a_folder_runs(name, dtype, command, tmp_path):
     assert re.fullmatch(r"100 samples, largest y \S+, 0 updates refused\n", done.stdout)
 
 
-COUNTING = """#include <stdio.h>
-static long multiplications;
-void count(void) { multiplications++; }
-__attribute__((destructor)) static void tell(void) { fprintf(stderr, "%ld", multiplications); }
-"""
-
-
 @pytest.mark.parametrize(
     ("name", "everything"), [*((name, True) for name in [*ALGORITHMS, "KF-PB"]), ("FxLMS", False), ("KF-OPC", False)]
 )
@@ -492,8 +448,7 @@ def test_the_readme_states_how_many_multiplications_a_sample_takes(name, everyth
     program = Program(controller, tmp_path)
     page = (export_c(controller, tmp_path / "folder").path.parent / "README.md").read_text()
     stated = int(re.search(r"about ([\d,]+) multiplications", page)[1].replace(",", ""))
-    ir, counter = tmp_path / "anc.ll", tmp_path / "count.c"
-    counter.write_text(COUNTING)
+    ir, counter = tmp_path / "anc.ll", FOLDER / "count.c"
     succeeds(clang, *FAST, "-ffp-contract=off", "-DLANES_OF_ONE=1", "-S", "-emit-llvm", program.exported.path, "-o", ir)
     text = re.sub(r"^(.* = fmul .*)$", r"\1\n  call void @count()", ir.read_text(), flags=re.M)
     ir.write_text(f"{text}\ndeclare void @count()\n")

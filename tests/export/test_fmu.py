@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -204,39 +205,10 @@ def test_the_same_controller_gives_the_same_file(tmp_path):
     assert one.read_bytes() == again.read_bytes() != two.read_bytes()
 
 
-HOST = """#include "fmi3Functions.h"
-#include <fcntl.h>
-#include <io.h>
-#include <stdio.h>
-#include <windows.h>
-
-#define CALL(name) ((name##TYPE *)(void (*)(void))GetProcAddress(unit, #name))
-
-int main(int argc, char **argv) /* the unit's library and its token; x(n) and e(n) come in, y(n) goes out */
-{
-    const fmi3ValueReference inputs[] = {1, 2}, output[] = {3};
-    const HMODULE unit = LoadLibraryA(argv[argc - 2]);
-    double in[2], y, last;
-    bool flags[3];
-    _setmode(_fileno(stdin), _O_BINARY), _setmode(_fileno(stdout), _O_BINARY);
-    void *one = CALL(fmi3InstantiateCoSimulation)("a", argv[argc - 1], "", 0, 0, 0, 0, NULL, 0, NULL, NULL, NULL);
-    for (long n = 0; fread(in, sizeof in, 1, stdin) == 1; n++) {
-        int failed = CALL(fmi3SetFloat64)(one, inputs, 2, in, 2);
-        failed |= CALL(fmi3DoStep)(one, n / 8000.0, 1 / 8000.0, 1, flags, flags + 1, flags + 2, &last);
-        failed |= CALL(fmi3GetFloat64)(one, output, 1, &y, 1);
-        if (failed) return 1;
-        fwrite(&y, sizeof y, 1, stdout);
-    }
-    return 0;
-}
-"""
-
-
 def test_the_library_for_windows_has_the_bits_of_python(opened, tmp_path):
     """A small host loads it, in wine. The error is an input of the next step."""
     wine, unit = tool("wine", "wine"), opened()
-    host, sources = tmp_path / "host.c", f"{unit.folder}/sources"
-    host.write_text(HOST)
+    host, sources = Path(__file__).with_name("windows_host.c"), f"{unit.folder}/sources"
     ran(*zig(), "-target", "x86_64-windows-gnu", "-I", sources, host, "-o", tmp_path / "host.exe")
     result = run(CONTROLLERS["KF-OPC"]())
     stream = np.stack([result.reference, np.r_[0.0, result.error[:-1]]], axis=1)

@@ -48,7 +48,7 @@ def differing(count, n, seed=3):
             (0.9 + 0.2 * i / count) * S * (np.arange(5) < 3 + i % 3),
             amplifier=amplifiers[i % 4],
             fs=FS,
-            sensor_noise_std=0.05 * (1 + i % 3),
+            sensor_noise_std=0.05 * (i % 3),  # some have none
         )
         for i in range(count)
     ]
