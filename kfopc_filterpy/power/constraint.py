@@ -224,7 +224,7 @@ class OutputPowerConstraint:
         return self.__dict__ | {"_room": None}
 
     def live_in(self, powers: np.ndarray, window: np.ndarray, numbers: np.ndarray) -> None:
-        """Go on in the arrays of a controller's block, which get the present numbers."""
+        """Go on in a block's arrays `powers`, `window` and `numbers`, which get the present numbers."""
         state = self._state
         places = state._replace(
             powers=powers.view(POWER).reshape(3), window=window, numbers=numbers.view(NUMBERS).reshape(1)

@@ -29,8 +29,6 @@ class Adaptation:
         Samples of this window at the limit.
     refused : int
         Updates in this window that the controller has refused.
-    normal : bool
-        Whether the last window was not too loud.
     """
 
     def __init__(self, n_loudspeakers: int, window: int) -> None:
@@ -46,11 +44,6 @@ class Adaptation:
         """Begin another window."""
         self._counted, self._energy = 0, np.zeros(self.n_loudspeakers)
         self.limited, self.refused = np.zeros(self.n_loudspeakers), 0
-
-    @property
-    def normal(self) -> bool:
-        """Whether the last window was not too loud."""
-        return self._loud_windows == 0
 
     def play(self, y: np.ndarray) -> bool:
         """Add control signals (J, n); return whether they complete a window, which is then to be judged."""

@@ -368,7 +368,7 @@ def run(
     rng : int or numpy.random.Generator, default 0
         Seed of the noise.
     **supervision
-        Settings of the `Supervisor`, for example ``on_divergence="freeze"``.
+        Settings of the `Supervisor`, for example ``pause_s=1.0``.
 
     Returns
     -------

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._types import PerLoudspeaker
-from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, per_loudspeaker
+from .._validate import as_count, as_number, as_positive, as_real_array, as_sample_count, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..controllers.base import Controller, WrappedController, checked_controller
 from ..controllers.channel_samples import through
@@ -24,7 +24,6 @@ from .faults import GOOD, KINDS, NOT_FINITE, REPEATED, STUCK, Inspector, is_repe
 from .health import Health
 from .loudness import Loudness
 
-ACTIONS = ("mute", "reset", "freeze")
 LONGEST_PAUSE = 64  # of the first pause
 MOST_REFUSALS = 3  # in a block; then the rest of it is not adapted to
 FORGOTTEN_S = 600.0  # without a divergence, after which the pauses are short again
@@ -65,12 +64,9 @@ class Supervisor(Checkpointed):
         Time in seconds over which the control fades in and out.
     mute_after_s : float, default 10
         Time in seconds without a usable sample after which the control fades out; with the next usable one it fades in.
-    on_divergence : {"mute", "reset", "freeze"}, default "mute"
-        What to do about a divergence: fade out and restart with a fresh copy after a pause; restart at once; or restore
-        the state of the last good window and do not adapt during the pause. Each pause is twice the last one, until
-        there was none for ten minutes.
     pause_s : float, default 2
-        First pause in seconds.
+        Pause in seconds after a divergence: the control fades out, and begins again with a fresh copy of the controller.
+        Each pause is twice the last one, until there was none for ten minutes.
     window_s : float, default 0.25
         Time over which the divergence monitor averages, in seconds.
     largest_gain : float, default 1e6
@@ -152,7 +148,6 @@ class Supervisor(Checkpointed):
         stuck_s: float = 0.01,
         fade_s: float = 0.05,
         mute_after_s: float = 10.0,
-        on_divergence: str = "mute",
         pause_s: float = 2.0,
         window_s: float = 0.25,
         largest_gain: float = 1e6,
@@ -169,7 +164,6 @@ class Supervisor(Checkpointed):
         self.n_references, self.n_microphones, self.n_loudspeakers = counts
         self.multichannel = bool(getattr(controller, "multichannel", max(counts) > 1))
         self.amplitude_limit = per_loudspeaker(amplitude_limit, self.n_loudspeakers, "amplitude_limit")
-        self.on_divergence = as_choice(on_divergence, "on_divergence", ACTIONS)
         self.largest_gain = as_positive(largest_gain, "largest_gain")
         self.recovery_samples = _remembered(controller)
         most_equal, rate = as_sample_count(stuck_s, fs, "stuck_s"), 1.0 / (0.1 * self.fs)
@@ -200,7 +194,6 @@ class Supervisor(Checkpointed):
         self._wanted = True  # whether the user wants control
         self._waiting = 0  # samples left of a pause
         self._replacement_due = False  # a fresh controller takes over when the loudspeakers are silent
-        self._frozen = 0  # samples left without adaptation
         self._since_bad_reference = self._since_fade = self.recovery_samples
         self._dies_away = max(self.recovery_samples, self._fade)
         self._silent_for = self._dies_away  # samples; nothing was played
@@ -212,8 +205,6 @@ class Supervisor(Checkpointed):
         # The last samples that the controller wanted to play, and those that were played, as far as an internal model
         # remembers them.
         self._wanted_y, self._played_y = np.zeros((2, self.n_loudspeakers, remembered))
-        # State of the last good window, and what it wanted to play.
-        self._good: Any = (self._fresh, self._wanted_y) if on_divergence == "freeze" else None
         self._adaptation = Adaptation(self.n_loudspeakers, self._window)
 
     @property
@@ -241,19 +232,14 @@ class Supervisor(Checkpointed):
         """Whether the controller has an internal model."""
         return bool(getattr(self._controller, "internal_model", False))
 
-    def _replace(self, state: Any, wanted: np.ndarray | None = None) -> None:
-        """Go on with a copy of a controller, which wanted to play `wanted` before, and with the limiter in use.
-
-        That knows what was played.
-        """
-        other = deepcopy(state)
-        for limiter in _limiters(other):  # which knows what was played before the copy was made
+    def _restart(self) -> None:
+        """Go on with a fresh copy of the controller, and with the limiter in use, which knows what was played."""
+        fresh = deepcopy(self._fresh)
+        for limiter in _limiters(fresh):
             limiter.reset()
-        if _limiters(self.controller) and isinstance(other, CoreController | WrappedController):
-            other.limiter = self.controller.limiter
-        self.controller = other
-        if wanted is not None:
-            self._wanted_y = wanted
+        if _limiters(self.controller) and isinstance(fresh, CoreController | WrappedController):
+            fresh.limiter = self.controller.limiter
+        self.controller = fresh
 
     @property
     def _target(self) -> float:
@@ -267,7 +253,7 @@ class Supervisor(Checkpointed):
         return self._gain == 0.0 and self._target == 0.0
 
     def __repr__(self) -> str:
-        state = "listening" if self._listening else "muted" if self.muted else "frozen" if self._frozen else "running"
+        state = "listening" if self._listening else "muted" if self.muted else "running"
         return f"<Supervisor of {getattr(self.controller, 'name', type(self.controller).__name__)}: {state}, {self.health!r}>"
 
     def fade_in(self) -> None:
@@ -452,11 +438,7 @@ class Supervisor(Checkpointed):
             self._listen(x, e, usable)
             wanted = np.zeros((self.n_loudspeakers, n))
         else:
-            frozen = min(self._frozen, n)
-            self._frozen -= frozen
-            adapt = usable & (since >= self.recovery_samples)
-            adapt[:frozen] = False
-            wanted = self._adapted(x, e, adapt)
+            wanted = self._adapted(x, e, usable & (since >= self.recovery_samples))
         return np.where(np.isfinite(wanted), wanted, 0.0), self._finite(wanted * gains)
 
     def _gains(self, n: int) -> np.ndarray:
@@ -471,7 +453,7 @@ class Supervisor(Checkpointed):
     def _listen(self, x: np.ndarray, e: np.ndarray, usable: np.ndarray) -> None:
         """Let the controller follow the noise with silent loudspeakers, and count the pause."""
         if self._replacement_due:
-            self._replace(self._fresh)
+            self._restart()
             self._replacement_due = False
         signals = [self._shaped(block) for block in (x, e)]
         try:
@@ -550,7 +532,7 @@ class Supervisor(Checkpointed):
             self._loudness.begin()
         if watched == "silence":
             self._hear_silence(x, e)
-        elif watched == "control" and not self._hear_control(x, e) and self._frozen == 0:
+        elif watched == "control" and not self._hear_control(x, e):
             self._watch_adaptation(y)
 
     def _hear_silence(self, x: np.ndarray, e: np.ndarray) -> None:
@@ -573,8 +555,6 @@ class Supervisor(Checkpointed):
             return False
         self._note("louder than before control")
         self._listening, self._suspected = True, loudness.windows
-        if self._frozen > 0:  # the last good state is good no longer
-            self._good = self._fresh, np.zeros_like(self._wanted_y)
         return True
 
     def _watch_adaptation(self, y: np.ndarray) -> None:
@@ -584,10 +564,6 @@ class Supervisor(Checkpointed):
         what = self._adaptation.judged(self.controller, self.largest_gain)
         if what:
             self._stop(f"diverged: {what}")
-        elif self._good is not None and self._adaptation.normal:
-            newest = self._loudness.windows[-1:]
-            if not self._loudness.is_louder(newest, self._loudness.ratio):
-                self._good = deepcopy(self.controller), self._wanted_y
 
     def _stop(self, why: str, at_once: bool = False) -> None:
         """Act on a divergence."""
@@ -596,19 +572,11 @@ class Supervisor(Checkpointed):
             self._pause = self._first_pause
         self.divergence_times_s.append(now)
         self._note(why)
-        if self.on_divergence == "freeze":
-            self._note("frozen")
-            self._replace(*self._good)
-            self._frozen = self._pause
-        elif self.on_divergence == "reset":
-            self._note("reset")
-            self._replace(self._fresh)
-        else:
-            self._note("muted")
-            self._waiting = self._pause
-            self._replacement_due = True  # it goes on until it is silent
-            if at_once:
-                self._gain = 0.0
+        self._note("muted")
+        self._waiting = self._pause
+        self._replacement_due = True  # it goes on until it is silent
+        if at_once:
+            self._gain = 0.0
         self._pause = min(2 * self._pause, LONGEST_PAUSE * self._first_pause)
         self._since_bad_reference = 0
         self._listening, self._suspected = False, None

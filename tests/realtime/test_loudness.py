@@ -166,24 +166,6 @@ def test_a_controller_whose_path_is_wrong_is_stopped(name: str, wrong: str) -> N
     assert CLEARED not in supervisor.health.counts
 
 
-@pytest.mark.parametrize("action", ["reset", "freeze"])
-def test_the_reaction_is_that_to_other_divergences(action: str) -> None:
-    supervisor, e, d = controlled(MAKERS["KF-OPC"](-PATH), on_divergence=action)
-    done = {"reset": "reset", "freeze": "frozen"}[action]
-    assert times(supervisor, done) == times(supervisor, BLAMED)
-    assert supervisor.health.counts[done] >= 2
-    if action == "freeze":  # the last good state is that from before it was louder
-        assert db(e, d, times(supervisor, done)[0] + 0.05, times(supervisor, done)[0] + 2.0) < 1.0
-
-
-def test_a_frozen_state_that_is_louder_is_not_good_any_more() -> None:
-    """The polarity changes at 4 s. What was good then is as wrong as what is learned after it."""
-    supervisor, e, d = controlled(MAKERS["KF-OPC"](PATH), from_4_s=-S, on_divergence="freeze", pause_s=10.0)
-    assert supervisor.health.counts[BLAMED] == 2
-    assert db(e, d, times(supervisor, BLAMED)[1], SECONDS) == pytest.approx(0.0, abs=0.1)  # a fresh one plays nothing
-    assert db(e, d, 2.0, 4.0) < -10.0
-
-
 def test_a_path_that_became_longer_is_in_the_report_of_a_run() -> None:
     """And three times within ten minutes end it."""
     x = np.tile(NOISE, 3)
