@@ -111,12 +111,44 @@
   // The page.
 
   place.innerHTML = `
-    <div class="listen-row"><button id="listen-play">Play</button>
-      ${Object.keys(LISTEN.controllers).map((name) => `<label><input type="radio" name="listen-controller" value="${name}"> ${name}</label>`).join(" ")}</div>
-    <div class="listen-row"><label>Too loud for the amplifier by <input type="range" id="listen-level" min="${LEAST_DB}" max="${MOST_DB}" step="0.5" value="6">
-      <output id="listen-level-db"></output></label></div>
-    <canvas id="listen-figure" width="760" height="420"></canvas>
+    <style>
+      #listen { --ink: var(--color-foreground-primary, CanvasText); --page: var(--color-background-primary, Canvas);
+        --line: var(--color-background-border, GrayText); --brand: var(--color-brand-content, #0a58a8); margin: 1rem 0 1.5rem; }
+      #listen svg, #listen canvas { display: block; width: 100%; color: var(--ink); }
+      #listen svg { max-width: 34rem; margin: 0 auto; font: 13px sans-serif; }
+      #listen canvas { height: 22rem; }
+      #listen canvas[hidden] { display: none; }
+      #listen button { display: block; margin: 0.75rem auto; min-width: 12rem; padding: 0.7rem 2rem; font: 600 1.25rem sans-serif;
+        color: var(--page); background: var(--brand); border: 0; border-radius: 2rem; cursor: pointer; }
+      #listen-controls { display: flex; flex-wrap: wrap; justify-content: center; align-items: center; gap: 0.4rem; font-size: 0.9rem; }
+      #listen-controls label { display: inline-flex; align-items: center; gap: 0.3rem; min-height: 2.25rem; white-space: nowrap; }
+      #listen-controls label:has([type="radio"]) { padding: 0 0.6rem; border: 1px solid var(--line); border-radius: 2rem; cursor: pointer; }
+      #listen-controls label:has(:checked) { border-color: var(--brand); box-shadow: inset 0 0 0 1px var(--brand); }
+      #listen input { accent-color: var(--brand); margin: 0; }
+      #listen-level { width: 5rem; }
+      #listen-level-db { min-width: 3rem; }
+      #listen-said { min-height: 1.6em; margin: 0.75rem 0; text-align: center; font-weight: 600; }
+      #listen-said:empty { display: none; }
+      #listen details { margin-top: 1rem; }
+    </style>
+    <svg viewBox="0 0 380 136" role="img" aria-label="A duct: noise, a microphone, a loudspeaker, and the place where you listen">
+      <g fill="none" stroke="currentColor" stroke-width="2">
+        <path d="M10 22H372M10 78H272M320 78H372M100 50V108H118M190 108H206M232 108H296V92"/>
+        <path d="M118 96H190V120H118ZM206 96V120L232 108ZM282 92H310L320 78H272Z" fill="var(--page)"/>
+      </g>
+      <path id="listen-wave" fill="none" stroke="#d55e00" stroke-width="2.5"/>
+      <g fill="currentColor"><circle cx="100" cy="50" r="6"/><circle cx="356" cy="50" r="6"/><text x="10" y="14">noise</text>
+        <text x="100" y="14" text-anchor="middle">microphone</text><text x="372" y="14" text-anchor="end">you listen here</text>
+        <text x="154" y="112" text-anchor="middle">controller</text><text x="219" y="133" text-anchor="middle">amplifier</text>
+        <text x="296" y="133" text-anchor="middle">loudspeaker</text></g>
+    </svg>
+    <button id="listen-play">▶ Play</button>
+    <div id="listen-controls">
+      ${Object.keys(LISTEN.controllers).map((name) => `<label><input type="radio" name="listen-controller" value="${name}">${name}</label>`).join("")}
+      <label>too loud by <input type="range" id="listen-level" min="${LEAST_DB}" max="${MOST_DB}" step="0.5" value="6">
+        <output id="listen-level-db"></output></label></div>
     <p id="listen-said" role="status"></p>
+    <canvas id="listen-figure" hidden></canvas>
     <details><summary>Your own noise and impulse responses</summary>
       ${["noise", "primary", "secondary"].map((name) => `<label>${name === "noise" ? "Noise at the reference" : `${name[0].toUpperCase() + name.slice(1)} path`} <input type="file" accept=".wav" id="listen-${name}"></label>`).join("<br>")}
       <p>WAV files with the same sample rate; the first channel counts. Without impulse responses, those of the built-in duct are used,
@@ -148,14 +180,15 @@
     };
     playing = { context, loop, error, disturbance, rated: now.rated };
     await context.resume();
-    at("play").textContent = "Stop";
+    at("play").textContent = "■ Stop";
+    at("figure").hidden = false;
     requestAnimationFrame(draw);
   }
 
   async function stop() {
     const { context } = playing;
     playing = null;
-    at("play").textContent = "Play";
+    at("play").textContent = "▶ Play";
     await context.close();
   }
 
@@ -169,32 +202,46 @@
 
   // Figures: the spectra, and the control power over the rating.
 
-  const COLOURS = { before: "#999999", error: "#d55e00", power: "#0072b2", line: "#555555" };
+  const COLOURS = { before: "#999999", error: "#d55e00", power: "#2b87d1" };
+  const [LEFT, TOP, GAP] = [52, 26, 56]; // of a plot, in pixels of the page
   const figure = at("figure").getContext("2d");
 
-  function axes(left, top, width, height, title, low, high, step, unit) {
-    figure.fillStyle = figure.strokeStyle = COLOURS.line;
-    figure.lineWidth = 0.5;
+  // The canvas has as many pixels as the screen; return its size on the page.
+  function cleared() {
+    const canvas = at("figure"), scale = window.devicePixelRatio || 1;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    Object.assign(canvas, { width: Math.round(scale * width), height: Math.round(scale * height) });
+    figure.scale(scale, scale);
     figure.font = "13px sans-serif";
-    figure.fillText(title, left, top - 8);
+    figure.fillStyle = getComputedStyle(canvas).color;
+    return [width - LEFT - 8, (height - TOP - GAP - 22) / 2];
+  }
+
+  function axes(top, width, height, title, low, high, step, ticks) {
+    const ink = figure.fillStyle, words = title.split("|");
+    let x = LEFT;
+    words.forEach((word) => {
+      const [text, colour] = word.split("#");
+      figure.fillStyle = COLOURS[colour] ?? ink;
+      figure.fillText(text, x, top - 9);
+      x += figure.measureText(text).width;
+    });
+    Object.assign(figure, { fillStyle: ink, strokeStyle: ink, lineWidth: 0.3 });
     const y = (value) => top + height * (1 - (Math.min(Math.max(value, low), high) - low) / (high - low));
     for (let value = low; value <= high; value += step) {
-      figure.fillText(`${value}${unit}`, left - 46, y(value) + 4);
-      figure.beginPath(), figure.moveTo(left, y(value)), figure.lineTo(left + width, y(value)), figure.stroke();
+      figure.textAlign = "right";
+      figure.fillText(`${value} dB`, LEFT - 6, y(value) + 4);
+      curve([[LEFT, y(value)], [LEFT + width, y(value)]], ink, 0.3);
     }
+    ticks.forEach((text, k) => {
+      figure.textAlign = k === ticks.length - 1 ? "right" : k ? "center" : "left";
+      figure.fillText(text, LEFT + (width * k) / (ticks.length - 1), top + height + 17);
+    });
+    figure.textAlign = "left";
     return y;
   }
 
-  function ticks(left, top, width, texts) {
-    figure.fillStyle = COLOURS.line;
-    texts.forEach((text, k) => {
-      figure.textAlign = k === 0 ? "left" : k === texts.length - 1 ? "right" : "center";
-      figure.fillText(text, left + (width * k) / (texts.length - 1), top + 16);
-    });
-    figure.textAlign = "left";
-  }
-
-  function curve(points, colour, width = 1.5) {
+  function curve(points, colour, width = 2) {
     figure.strokeStyle = colour;
     figure.lineWidth = width;
     figure.beginPath();
@@ -202,39 +249,45 @@
     figure.stroke();
   }
 
+  // The sound in the drawing: behind the loudspeaker it has the amplitude that is left.
+  function wave(left) {
+    const t = performance.now() / 250;
+    const points = Array.from({ length: 72 }, (_, k) => {
+      const x = 14 + 5 * k, share = Math.min(Math.max((x - 270) / 60, 0), 1);
+      return `${x} ${50 - 18 * (1 + share * (Math.min(left, 1.4) - 1)) * Math.sin(x / 9 - t)}`;
+    });
+    at("wave").setAttribute("d", `M${points.join("L")}`);
+  }
+
   function draw() {
     if (!playing) return;
-    const { error, disturbance, rated } = playing, [left, width] = [60, 690];
-    figure.fillStyle = "#ffffff";
-    figure.fillRect(0, 0, 760, 420);
+    const { error, disturbance, rated } = playing, [width, height] = cleared();
+    const shown = Math.min(2000, signals.fs / 2);
     const spectra = [disturbance, error].map((analyser) => {
       const values = new Float32Array(analyser.frequencyBinCount);
       analyser.getFloatFrequencyData(values);
-      return values.subarray(0, Math.floor((2000 / (signals.fs / 2)) * values.length) || values.length);
+      return values.subarray(0, Math.floor((shown / (signals.fs / 2)) * values.length));
     });
-    const peak = Math.max(-100, ...spectra[0]);
-    const level = axes(left, 30, width, 150, "Spectrum at the microphone: noise (grey), error (orange)", -60, 0, 20, " dB");
-    const shown = Math.min(2000, signals.fs / 2);
-    ticks(left, 180, width, [0, 1, 2, 3, 4].map((k) => `${(shown * k) / 4} Hz`));
+    const peak = Math.max(-100, ...spectra[0]), steps = width < 420 ? [0, 2, 4] : [0, 1, 2, 3, 4];
+    const level = axes(TOP, width, height, "At the microphone: |noise#before|, |what is left#error", -60, 0, 20, steps.map((k) => `${(shown * k) / 4} Hz`));
     spectra.forEach((values, k) =>
-      curve(Array.from(values, (value, n) => [left + (width * n) / values.length, level(value - peak)]), k ? COLOURS.error : COLOURS.before));
-    const ratio = axes(left, 240, width, 150, "Last 20 s: control power over the rating (blue), error over noise (orange)", -20, 40, 20, " dB");
-    ticks(left, 390, width, [0, 1, 2, 3, 4].map((k) => `${(SHOWN_S * k) / 4} s`));
-    const x = (n) => left + (width * n * (history[0]?.samples ?? 1)) / (SHOWN_S * signals.fs);
+      curve(Array.from(values, (value, n) => [LEFT + (width * n) / values.length, level(value - peak)]), k ? COLOURS.error : COLOURS.before));
+    const ratio = axes(TOP + height + GAP, width, height, "|power / rating#power|, |what is left / noise#error", -20, 40, 20, steps.map((k) => `${(SHOWN_S * k) / 4} s`));
+    const x = (n) => LEFT + (width * n * (history[0]?.samples ?? 1)) / (SHOWN_S * signals.fs);
     const db = (value) => 10 * Math.log10(Math.max(value, 1e-6));
-    curve([[left, ratio(0)], [left + width, ratio(0)]], COLOURS.line);
+    curve([[LEFT, ratio(0)], [LEFT + width, ratio(0)]], figure.fillStyle, 1);
     curve(history.map(({ y, samples }, n) => [x(n), ratio(db(y / samples / rated))]), COLOURS.power);
     curve(history.map(({ e, d }, n) => [x(n), ratio(db(e / d))]), COLOURS.error);
     const recent = history.slice(-Math.ceil(signals.fs / (history[0]?.samples ?? 1)));
     if (recent.length) {
-      const sum = (name) => recent.reduce((all, one) => all + one[name], 0), { factor, status } = recent.at(-1);
+      const sum = (name) => recent.reduce((all, one) => all + one[name], 0), { status } = recent.at(-1);
+      wave(Math.sqrt(sum("e") / sum("d")));
       const parts = [
-        `noise reduction ${(-db(sum("e") / sum("d"))).toFixed(1)} dB`,
-        `control power ${(sum("y") / sum("samples") / rated).toFixed(2)} of the rating`,
-        ...(chosen() === "KF-OPC" ? [`constraint factor ${factor.toFixed(2)}`] : []),
+        `Noise reduction ${(-db(sum("e") / sum("d"))).toFixed(1)} dB`,
+        `power ${(sum("y") / sum("samples") / rated).toFixed(2)} of the rating`,
         ...(status ? ["switched off: its numbers grew beyond all limits"] : []),
       ];
-      said(`In the last second: ${parts.join(", ")}.`);
+      said(parts.join(", "));
     }
     requestAnimationFrame(draw);
   }
@@ -274,4 +327,5 @@
   place.querySelectorAll("input[type=radio]").forEach((radio) => { radio.onchange = () => change(); });
   place.querySelectorAll("input[type=file]").forEach((input) => { input.onchange = own; });
   showLevel();
+  wave(1);
 })();

@@ -123,6 +123,8 @@ def page(tmp_path_factory):
     (folder / "page.html").write_text(
         f"<!doctype html><meta charset=utf-8>{body.replace('_static/', '')}", encoding="utf-8"
     )
+    phone = '<!doctype html><meta charset=utf-8><meta name="viewport" content="width=device-width">'
+    (folder / "phone.html").write_text(phone + body.replace("_static/", ""), encoding="utf-8")
     return (folder / "page.html").as_uri()
 
 
@@ -166,6 +168,27 @@ def test_the_page_is_played_and_says_what_it_does(page, browser):
         browser.until(lambda _: len(numbers()) == 2 and settled(*numbers()))  # noqa: B023
     browser.find_element("id", "listen-play").click()
     assert not [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [390, 1300])
+def test_the_page_fits_a_phone_and_a_screen(width, page, browser):
+    """Nothing is wider than the window, the button comes first, and the drawing's words are at least 11 pixels high."""
+    shape = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", shape)
+    try:
+        browser.get(page.replace("page.html", "phone.html"))
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        button, controls, word = (
+            browser.execute_script("return document.querySelector(arguments[0]).getBoundingClientRect()", which)
+            for which in ("#listen-play", "#listen-controls", "#listen svg text")
+        )
+        assert 0 < button["bottom"] <= controls["top"] < 900
+        assert word["height"] > 11
+        one_line = controls["height"] < 60
+        assert one_line == (width == 1300)
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 @pytest.mark.slow
