@@ -98,7 +98,7 @@ def is_usual_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> bool:
     """Return whether z, R and H are arrays of the sizes that filterpy uses as they are, H that of the filter."""
     rows, row = kf.dim_z, kf.H if H is None else H
     if type(z) is float:
-        usual = rows == 1 and (H is None or np.ndim(kf.x) == 2)
+        usual = rows == 1
     else:
         usual = type(z) is np.ndarray and z.shape in ((rows, 1), (rows,)) and (H is None or z.ndim == np.ndim(kf.x))
     return (
