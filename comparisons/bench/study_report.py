@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy._writing import jsonable
-from kfopc_filterpy.verdict.items import FigureItem, Sound, Table, require_stem
+from kfopc_filterpy.verdict.items import FigureItem, Sound, Table
 
 from .merit import MERITS, merit_table
 
@@ -122,7 +122,6 @@ class StudyReport:
     tables: list[Table] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        require_stem(self.name, "name")
         for algorithm, figures in self.algorithms.items():
             if unknown := set(figures) - set(MERITS):
                 raise ValueError(

@@ -13,7 +13,8 @@ from kfopc_filterpy import Plant, SimulationResult
 from kfopc_filterpy.bounds import power_constrained_solution, wiener_solution
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import Duct, duct_plant, fir_path, secondary_path_gain
-from kfopc_filterpy.plot import plot_constraint_factor, plot_error_spectra, plot_nse, plot_output_power
+from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
+from kfopc_filterpy.plot.style import labelled
 from kfopc_filterpy.signals import compressor_noise
 
 from .. import bench
@@ -230,6 +231,12 @@ def _figures_of(results: Mapping[str, SimulationResult], plant: Plant) -> list[F
         # With longer segments the harmonics are so sharp that the curves hide each other.
         plot_error_spectra([results[name] for name in names], band=(0, 3000), segment_s=0.05, ax=ax)
 
+    def factors(ax: Any) -> None:
+        for name in ("KF-OPC", "MOV-FxLMS"):
+            run, style = results[name], curve_style(name) | {"marker": ""}
+            ax.plot(run.time_s[::100], run.constraint_factor[::100], label=name, **style)
+        labelled(ax, xlabel="Time (s)", ylabel="Constraint factor α").set_ylim(0, 1.05)
+
     return [
         parts.draw(
             "a-nse",
@@ -251,7 +258,7 @@ def _figures_of(results: Mapping[str, SimulationResult], plant: Plant) -> list[F
         parts.draw(
             "constraint-factor",
             "Constraint factor. Both follow the same powers, so the lines coincide if the residuals are alike.",
-            lambda ax: plot_constraint_factor([results["KF-OPC"], results["MOV-FxLMS"]], ax=ax),
+            factors,
         ),
         parts.draw_paths(
             "Primary and secondary path.", {name: fir_path(taps, plant.fs) for name, taps in paths.items()}

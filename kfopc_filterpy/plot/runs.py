@@ -1,4 +1,4 @@
-"""Figures of runs over time: convergence, output power, constraint factor.
+"""Figures of runs over time: convergence and output power.
 
 These rules hold for the functions here and in `kfopc_filterpy.plot.signals`:
 
@@ -27,7 +27,7 @@ import numpy as np
 from .._validate import as_choice, as_positive, as_sample_count
 from .._writing import made_folder, replacing
 from ..metrics import nse_db, short_time_power
-from .results import DISTURBANCE, RATED, Curve, Results, curves, one_channel, thinned
+from .results import DISTURBANCE, RATED, Curve, Results, curves, thinned
 from .style import labelled, new_axes
 
 if TYPE_CHECKING:
@@ -199,53 +199,6 @@ def plot_output_power(
         ax.set_ylim(0, 1.08 * max([highest, *rated]) or 1.0)
     quantity = f"Output power ({unit.strip() or 'mean square'})"
     return _over_time(ax, shown, f"{quantity}\nover {_window_in_words(window_s)}")
-
-
-def plot_constraint_factor(results: Results, *, channel: int | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the constraint factor over time; 1 is no constraint.
-
-    Parameters
-    ----------
-    results : SimulationResult, sequence or mapping
-        Runs, one per name. Controllers that do not tell their factor are left out.
-    channel : int, optional
-        Loudspeaker to show, from 0; by default a curve for each that has a factor of its own.
-    ax : matplotlib.axes.Axes, optional
-        Axes to draw into, by default new ones.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        The axes drawn into.
-
-    Raises
-    ------
-    ValueError
-        If no controller tells its factor.
-
-    Examples
-    --------
-    >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import Plant, kf_opc, simulate
-    >>> from kfopc_filterpy.signals import tone
-    >>> controller = kf_opc(8, [1.0], rated_power=0.1, fs=16000, state_noise=1e-9, measurement_noise=1e-3)
-    >>> result = simulate(controller, tone(400.0, 0.1, fs=16000), Plant([1.0], [1.0], fs=16000))
-    >>> ax = plot_constraint_factor(result)
-    >>> ax.get_ylabel()
-    'Constraint factor α'
-    >>> plt.close(ax.figure)
-    """
-    shown = [curve for curve in curves(results, single=True) if not np.all(np.isnan(curve.run.constraint_factor))]
-    if not shown:
-        raise ValueError("results must hold a constraint factor, but no controller has told one")
-    factors = [curve.run.constraint_factor for curve in shown]
-    if channel is not None:
-        factors = [one_channel(factor, channel) for factor in factors]
-    ax = new_axes(ax)
-    for i, (curve, factor) in enumerate(zip(shown, factors, strict=True)):
-        curve.draw(ax, factor, i)
-    ax.set_ylim(0, 1.05)
-    return _over_time(ax, shown, "Constraint factor α")
 
 
 def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> tuple[Path, Path]:

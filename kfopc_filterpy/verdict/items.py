@@ -44,23 +44,12 @@ class Table:
         Headings of the columns.
     rows : sequence of sequence
         Rows of cells, each a text or a number.
-
-    Raises
-    ------
-    ValueError
-        A row has another number of cells than there are headings, or the stem cannot name a file.
     """
 
     stem: str
     caption: str
     headings: Sequence[str]
     rows: Sequence[Sequence[str | float]]
-
-    def __post_init__(self) -> None:
-        require_stem(self.stem, "stem")
-        for row in self.rows:
-            if len(row) != len(self.headings):
-                raise ValueError(f"rows must have {len(self.headings)} cells, as there are headings, got {row}")
 
     @property
     def cells(self) -> list[list[str]]:
@@ -99,7 +88,6 @@ class FigureItem:
     def __post_init__(self) -> None:
         import matplotlib.pyplot as plt
 
-        require_stem(self.stem, "stem")
         plt.close(self.figure)
 
     @property
@@ -138,11 +126,6 @@ class Sound:
         the noise without control.
     from_s : float, default 0.0
         Where the excerpt begins that the page plays, in s.
-
-    Raises
-    ------
-    ValueError
-        The stem cannot name a file, or the excerpt begins before the sound.
     """
 
     stem: str
@@ -150,11 +133,6 @@ class Sound:
     signal: np.ndarray
     group: str = ""
     from_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_stem(self.stem, "stem")
-        if not self.from_s >= 0:
-            raise ValueError(f"from_s must be a time in s from 0 on, got {self.from_s}")
 
     def excerpt(self, signal: np.ndarray, fs: float) -> np.ndarray:
         """Return the part of a signal at a rate `fs` that the page plays: 4 s, or what there is of them."""
@@ -211,8 +189,3 @@ def write_files(
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([table.headings, *table.rows])
         write_whole(file_of(folder, name, table), text.getvalue())
-
-
-def require_stem(name: str, argument: str) -> None:
-    if not isinstance(name, str) or not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name):
-        raise ValueError(f"{argument} must be lower-case letters, digits and '-', for it names files, got {name!r}")

@@ -176,7 +176,6 @@ def test_a_table_as_a_file_has_all_digits(tmp_path):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: study("../tonal"), "name must be lower-case letters"),
         (lambda: study(figures=2 * [FigureItem("a", "", figure())]), "figures of study 'tonal' .* got a twice"),
         (lambda: study(tables=[POWERS, EMPTY, POWERS]), "tables of study 'tonal' .* got powers twice"),
         (lambda: study(algorithms={"KF-ANC": {"loudness": 1.0}}), r"unknown figures of merit \['loudness'\]"),

@@ -162,15 +162,6 @@ def test_output_power_against_the_rated_power(noise, tonal):
     assert ax.get_ylabel() == "Output power (mean square)\nover 250 ms"
 
 
-def test_constraint_factor_leaves_out_controllers_that_say_none(tonal):
-    silent = replace(tonal["FxLMS"], constraint_factor=np.full_like(tonal["FxLMS"].error, np.nan))
-    ax = plotting.plot_constraint_factor([tonal["KF-OPC"], silent])
-    assert _labels(ax) == ["KF-OPC"]
-    assert _line(ax, "KF-OPC").get_ydata()[-1] == pytest.approx(tonal["KF-OPC"].constraint_factor[-1], abs=1e-3)
-    with pytest.raises(ValueError, match="no controller has told one"):
-        plotting.plot_constraint_factor(silent)
-
-
 def test_a_divergence_is_written_in_the_legend(tonal):
     run = _diverged(tonal["FxLMS"])
     for ax in (
@@ -261,14 +252,6 @@ def test_output_power_has_a_curve_for_each_loudspeaker():
     one = plotting.plot_output_power(run, window_s=0.01, channel=1)
     assert _labels(one) == ["KF-OPC", "Rated power 1"]
     np.testing.assert_array_equal(_line(one, "KF-OPC").get_ydata(), ax.get_lines()[1].get_ydata())
-
-
-def test_constraint_factor_is_one_or_one_for_each_loudspeaker():
-    run = multichannel_result()
-    assert _labels(plotting.plot_constraint_factor(run)) == ["KF-OPC"]
-    each = multichannel_result(constraint_factor=np.array([[0.5], [0.25]]) * np.ones(4000))
-    assert _labels(plotting.plot_constraint_factor(each)) == ["KF-OPC, 2 loudspeakers"]
-    assert _line(plotting.plot_constraint_factor(each, channel=1), "KF-OPC").get_ydata()[0] == 0.25
 
 
 def test_channels_that_are_missing_or_not_there_are_refused():

@@ -46,17 +46,3 @@ def test_a_residual_far_louder_than_the_first_sound_does_not_silence_it(tmp_path
 def test_a_table_for_the_terminal_aligns_numbers_to_the_right():
     table = Table("powers", "Powers", ["paths", "power"], [["duct", 0.123456789], ["band-pass", np.nan]])
     assert table.lines == ["paths       power", "duct       0.1235", "band-pass       –"]
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Sound("a b", "", D), "stem must be lower-case letters"),
-        (lambda: Sound("a", "", D, from_s=-1.0), "from_s must be a time in s from 0 on, got -1"),
-        (lambda: Table("../powers", "", [], []), r"stem must be lower-case letters.*got '../powers'"),
-        (lambda: Table("powers", "", ["x", "y"], [[1.0]]), "rows must have 2 cells, as there are headings, got"),
-    ],
-)
-def test_what_no_page_shows_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
