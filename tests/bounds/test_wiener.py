@@ -82,35 +82,29 @@ def test_coherence_bound_is_the_incoherent_share():
     assert best.noise_reduction_db <= bound.overall_db + 0.15
 
 
+X, D, S = _scene()
+PLANT = Plant(S, fs=FS)
+
+
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("change", "message"),
     [
-        (
-            lambda x, d, plant: wiener_solution(x[:9], plant, n_taps=4, disturbance=d[:9]),
-            "reference must have at least 10 samples",
-        ),
-        (
-            lambda x, d, plant: wiener_solution(0 * x, plant, n_taps=4, disturbance=d),
-            "reference through the secondary path must not be silent",
-        ),
-        (lambda x, d, plant: wiener_solution(x, plant, n_taps=4, disturbance=0 * d), "disturbance must not be silent"),
-        (
-            lambda x, d, plant: wiener_solution(x, plant, n_taps=4, disturbance=d, regularization=-1),
-            "regularization must not be negative",
-        ),
-        (
-            lambda x, d, plant: wiener_solution(x, plant.changed_at(0.1, secondary=[1.0]), n_taps=4, disturbance=d),
-            "wiener_solution needs a plant that does not change",
-        ),
-        (lambda x, d, _: coherence_bound(x, d, FS, segment=1024), "reference must have at least 8192"),
-        (lambda x, d, _: coherence_bound(0 * x, d, FS, segment=64), "must not be silent"),
+        ({"reference": X[:9], "disturbance": D[:9]}, "reference must have at least 10 samples"),
+        ({"reference": 0 * X}, "reference through the secondary path must not be silent"),
+        ({"disturbance": 0 * D}, "disturbance must not be silent"),
+        ({"regularization": -1}, "regularization must not be negative"),
+        ({"plant": PLANT.changed_at(0.1, secondary=[1.0])}, "wiener_solution needs a plant that does not change"),
     ],
 )
-def test_wiener_refuses(call, message):
-    x, d, s = _scene()
-    plant = Plant(s, fs=FS)
+def test_wiener_refuses(change, message):
     with pytest.raises(ValueError, match=message):
-        call(x, d, plant)
+        wiener_solution(**{"reference": X, "plant": PLANT, "disturbance": D, "n_taps": 4} | change)
+
+
+def test_coherence_refuses():
+    for x, segment, message in ((X, 1024, "reference must have at least 8192"), (0 * X, 64, "must not be silent")):
+        with pytest.raises(ValueError, match=message):
+            coherence_bound(x, D, FS, segment=segment)
 
 
 # ---- Directions that float64 correlations do not resolve

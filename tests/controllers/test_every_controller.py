@@ -26,7 +26,7 @@ from kfopc_filterpy.controllers import RefusedUpdate
 
 # What a step refuses, and what it takes.
 LOUD = [-1e160, 1e308]
-UNUSABLE = [np.nan, np.inf, *LOUD, "1.0", np.ma.masked, np.datetime64("2020-01-01")]
+UNUSABLE = [np.nan, np.inf, *LOUD, "1.0", b"1", 1j, object(), 10**400, np.ma.masked, np.datetime64("2020-01-01")]
 HUGE = [1e12, -1e24, 1e49]
 PYTHONS = [name for name in ALL if "filterpy's" in name or "a user's" in name]  # filters whose steps are in Python
 
@@ -176,7 +176,7 @@ def bad_sample(controller: Any, room: Room, half: str, value: Any, samples: int)
 
 @pytest.mark.parametrize("half", ["control_signal", "update"])
 @pytest.mark.parametrize("name", ALL)
-@settings(max_examples=4)
+@settings(max_examples=6)
 @given(value=st.sampled_from([*UNUSABLE, *HUGE]), samples=st.integers(0, 60))
 def test_a_refused_sample_leaves_the_state_as_it_was(name: str, half: str, value: Any, samples: int) -> None:
     controller = ALL[name]()

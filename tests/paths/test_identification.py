@@ -125,3 +125,12 @@ def test_an_excitation_without_high_frequencies_leaves_them_uncertain():
     assert uncertainty[150:].min() > 0.5  # above 2.3 kHz the ridge decides
     true = path_uncertainty(SHORT_PATH[np.newaxis], estimate_path(sent, heard, 32, 8000.0).taps)
     assert np.mean(uncertainty < true) < 0.02
+
+
+def test_the_uncertainty_falls_with_the_root_of_the_duration():
+    plant = Plant(SHORT_PATH, fs=8000, sensor_noise_std=0.2)
+
+    def mean(duration_s):
+        return identify_secondary_path(plant, n_taps=32, duration_s=duration_s, rng=3).uncertainty.mean()
+
+    assert mean(16.0) / mean(4.0) == pytest.approx(0.5, rel=0.1)
