@@ -28,7 +28,7 @@ from .._validate import as_choice, as_positive, as_sample_count
 from .._writing import made_folder, replacing
 from ..metrics import nse_db, short_time_power
 from .results import DISTURBANCE, RATED, Curve, Results, curves, thinned
-from .style import labelled, new_axes
+from .style import labelled, new_axes, plain_log
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -194,6 +194,7 @@ def plot_output_power(
         ax.axhline(value, label=f"Rated power {value:.4g}{unit}", **RATED)
     if rated and highest > 0 and not rated[-1] / 10 <= highest <= 10 * rated[-1]:
         ax.set_yscale("log")
+        plain_log(ax.yaxis)
         ax.set_ylim(min(rated[0], highest) / 10, 2 * max(rated[-1], highest))
     else:
         ax.set_ylim(0, 1.08 * max([highest, *rated]) or 1.0)

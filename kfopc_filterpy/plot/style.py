@@ -11,6 +11,7 @@ from .._types import NumberOrArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
 
 # Colour, line style and marker of each algorithm. The first seven have Okabe and Ito's colours, which colour-blind
 # readers tell apart; line styles and markers serve prints in grey.
@@ -100,6 +101,14 @@ def frequency_axis(ax: Axes, frequencies: np.ndarray) -> Axes:
     ax.xaxis.set_major_formatter(EngFormatter(sep=""))
     ax.xaxis.set_minor_formatter(NullFormatter())
     return labelled(ax, xlabel="Frequency (Hz)")
+
+
+def plain_log(axis: Axis) -> None:
+    """Write the ticks of a logarithmic axis of powers out: 0.1, 1, 10, 100."""
+    from matplotlib.ticker import NullFormatter, StrMethodFormatter
+
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def phase_axis(ax: Axes, label: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from kfopc_filterpy import __version__
 from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
-from kfopc_filterpy.plot.style import new_axes
+from kfopc_filterpy.plot.style import new_axes, plain_log
 
 from .._writing import write_whole
 from .assessment import nominal_hz
@@ -127,6 +127,7 @@ def _bound(verdict: Assessment) -> Any:
     powers, reached = verdict.curve
     right = 2 * scale * powers.max()  # a run without a constraint may ask for a million times as much
     ax.semilogx(scale * powers, reached, color="0.2", label="best fixed filter")
+    plain_log(ax.xaxis)
     rated = 1.0 if several else scale * verdict.limits.rated_power
     ax.axvline(rated, color="0.2", linestyle="--", label="rated power")
     least = rated * np.max(verdict.least_rated_power / verdict.limits.rated_power)
@@ -138,7 +139,7 @@ def _bound(verdict: Assessment) -> Any:
         power = np.max(figures["of_rated_power"]) if several else figures["output_power"]
         if power and own is not None and np.isfinite(power) and np.isfinite(own):
             style = curve_style(name)
-            label = name if scale * power <= right else f"{name}, beyond: {scale * power:.2g}"
+            label = name if scale * power <= right else f"{name}, beyond: {float(f'{scale * power:.2g}'):g}"
             # The verdict's own run is filled and in front: the others often lie within its marker.
             fill, front = (style["color"], 4) if name == verdict.algorithm else ("none", 3)
             ax.plot(

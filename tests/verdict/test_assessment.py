@@ -21,6 +21,7 @@ from kfopc_filterpy.signals import Recording, band_limited_noise
 from kfopc_filterpy.verdict import assess
 from kfopc_filterpy.verdict.assessment import CAUSES, SCHEMA, advice_on
 from kfopc_filterpy.verdict.candidates import STEP_SIZES
+from kfopc_filterpy.verdict.verdict_page import _bound
 
 FS, SECONDS, TAPS = 8000, 3.0, 32
 PLENTY = 100.0  # times what full control takes
@@ -262,6 +263,15 @@ def test_the_levels_are_those_of_the_sounds(written):
     assert whole == pytest.approx(10 * np.log10(np.mean(half**2) / 4e-10), abs=0.3)
     less = verdict.levels.before_dba - verdict.levels.after_dba
     assert less == pytest.approx(verdict.noise_reduction_db, abs=3.0)  # the noise is where A is flat within 3 dB or so
+
+
+def test_the_watts_of_the_lead_figure_are_written_out(written):
+    ax = _bound(written[0])
+    ax.figure.canvas.draw()
+    low, high = ax.get_xlim()
+    shown = [tick.get_text() for tick in ax.get_xticklabels() if low <= tick.get_position()[0] <= high]
+    assert len(shown) >= 2
+    assert all(re.fullmatch(r"0\.0*1|10*", text) for text in shown)
 
 
 def test_a_third_octave_that_the_control_makes_louder_is_noted():
