@@ -179,7 +179,8 @@ def as_nonnegative(value: Any, name: str, *, unit: str = "") -> float:
 def as_count(value: Any, name: str, *, minimum: int = 1) -> int:
     """Return `value` as an int of at least `minimum`."""
     try:
-        count = operator.index(None if isinstance(value, bool) else value)  # True is no 1
+        number: Any = None if isinstance(value, bool) else value  # True is no 1
+        count = operator.index(number)
     except TypeError as error:
         raise TypeError(f"{name} must be a whole number, got {value!r}") from error
     if count < minimum:
