@@ -166,7 +166,7 @@ def noise_of(kind: str, n: int, rng: np.random.Generator) -> np.ndarray:
 KINDS = st.sampled_from(["tone", "tones", "constant", "chirp", "square", "clicks", "white", "narrow", "walk"])
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     kinds=st.tuples(KINDS, KINDS),
     change=st.sampled_from(["jump", "fade", "none"]),

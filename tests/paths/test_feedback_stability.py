@@ -152,7 +152,7 @@ def test_loops_side_by_side_have_the_lesser_margin_and_turned_microphones_do_not
     """Microphones that hear sums of the signals, by an orthogonal matrix, and filters that undo this."""
     rng, outcomes = np.random.default_rng(0), set()
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    for _ in range(12):
+    for _ in range(6):
         loops = random_loop(rng), random_loop(rng)
         alone = [internal_model_margin(w, played(s), estimate) for w, s, estimate in loops]
         w, *paths = (side_by_side(*both) for both in zip(*loops, strict=True))
@@ -172,7 +172,7 @@ def test_loops_side_by_side_have_the_lesser_margin_and_turned_microphones_do_not
 def test_stability_of_several_channels_is_that_of_the_poles() -> None:
     """The determinant of I - F W in polynomials, and its zeros."""
     rng, outcomes = np.random.default_rng(3), set()
-    for _ in range(30):
+    for _ in range(12):
         w, f = rng.standard_normal((2, 2, 5)), np.pad(rng.standard_normal((2, 2, 3)), ((0, 0), (0, 0), (1, 0)))
         w *= rng.uniform(0.02, 0.3)
         left = [[-sum(np.convolve(f[i, j], w[j, k]) for j in range(2)) for k in range(2)] for i in range(2)]

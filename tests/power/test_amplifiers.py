@@ -12,10 +12,10 @@ from kfopc_filterpy import (
     LinearAmplifier,
     Plant,
     SoftSaturationAmplifier,
-    clipped_fraction,
     fx_lms,
     simulate,
 )
+from kfopc_filterpy.metrics import clipped_fraction
 from kfopc_filterpy.power.amplifiers import compiled_model
 
 signals = st.floats(-1e9, 1e9)

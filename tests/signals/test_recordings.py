@@ -14,7 +14,8 @@ import soundfile
 from helpers.files import FS, WRITERS, signal
 
 from kfopc_filterpy.paths import read_path
-from kfopc_filterpy.signals import Recording, calibration_factor, read_recording, write_wav
+from kfopc_filterpy.signals import Recording, read_recording, write_wav
+from kfopc_filterpy.signals.recordings import calibration_factor
 
 # ---- every format
 
