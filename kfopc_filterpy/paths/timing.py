@@ -17,40 +17,44 @@ def timing_fault(sent: np.ndarray, heard: np.ndarray, fs: float, names: tuple[st
 
     The response from one to the other is estimated in segments of about a second. Its delay rises evenly if the clocks
     differ, and jumps where samples are missing. A cause is named only if putting it right leaves clearly less unexplained.
-    Sweeps, of which each segment has another band, show no drift.
+    The halves of the record are compared, too: of sweeps, each second has another band. A single sweep shows no drift.
     """
     from scipy.ndimage import map_coordinates
 
     n = min(sent.size, heard.size)
-    count = int(np.clip(n / (_SEGMENT_S * fs), _LEAST_SEGMENTS, _MOST_SEGMENTS))
-    size = n // count
-    if size < 64:
-        return None
-    sent, heard = sent[: count * size] - np.mean(sent), heard[: count * size] - np.mean(heard)
-    first, second = names
+    sent, heard = sent[:n] - np.mean(sent), heard[:n] - np.mean(heard)
+    left = _unexplained(sent, heard)
+    for count in (int(np.clip(n / (_SEGMENT_S * fs), _LEAST_SEGMENTS, _MOST_SEGMENTS)), 2):
+        cause, places = _cause(sent, heard, count, fs, names[1])
+        if cause and _unexplained(sent, map_coordinates(heard, [places], order=3)) < _LEAST_GAIN * left:
+            return cause
+    lead = _lead(sent, heard) if left < _LEAST_LEAD else 0
+    return f"{names[1]} comes {1e3 * lead / fs:.3g} ms before {names[0]}: are the files swapped?" if lead else None
+
+
+def _cause(sent: np.ndarray, heard: np.ndarray, count: int, fs: float, name: str) -> tuple[str, np.ndarray]:
+    """Return what the delays of segments show, as a sentence, and where each sample should be; nothing if they are equal."""
+    every, size = np.arange(sent.size), sent.size // count
+    sent, heard = sent[: count * size], heard[: count * size]
     delays = _delays(sent.reshape(count, size), heard.reshape(count, size))
     times = (np.arange(count) + 0.5) * size
     slope, start = np.polyfit(times, delays, 1)
     splits = [np.concatenate([part - part.mean() for part in np.split(delays, [at])]) for at in range(1, count)]
     at = 1 + int(np.argmin([np.sum(left**2) for left in splits]))
     jump = round(float(np.median(delays[at:]) - np.median(delays[:at])))
-    n_samples, left, cause = sent.size, _unexplained(sent, heard), ""
-    if jump and np.sum(splits[at - 1] ** 2) < np.sum((delays - start - slope * times) ** 2):
-        places = np.arange(n_samples) + np.where(np.arange(n_samples) < at * size, 0, jump)
+    if count > 2 and jump and np.sum(splits[at - 1] ** 2) < np.sum((delays - start - slope * times) ** 2):
         cause = (
-            f"from about {at * size / fs:.2g} s on, {second} is {abs(jump)} samples {'later' if jump > 0 else 'earlier'} than "
+            f"from about {at * size / fs:.2g} s on, {name} is {abs(jump)} samples {'later' if jump > 0 else 'earlier'} than "
             "before: a block was lost, so record both again in one stream, or cut both there."
         )
-    elif abs(slope) * n_samples >= _LEAST_DELAY:
-        places = np.arange(n_samples) * (1 + slope)
+        return cause, every + np.where(every < at * size, 0, jump)
+    if abs(slope) * every.size >= _LEAST_DELAY:
         cause = (
-            f"the delay of {second} drifts by {slope * n_samples:+.1f} samples, so the clocks differ by {1e6 * slope:+.1f} ppm: "
+            f"the delay of {name} drifts by {slope * every.size:+.1f} samples, so the clocks differ by {1e6 * slope:+.1f} ppm: "
             "record both with one interface, or with a common clock."
         )
-    if cause and _unexplained(sent, map_coordinates(heard, [places], order=3)) < _LEAST_GAIN * left:
-        return cause
-    lead = _lead(sent, heard) if left < _LEAST_LEAD else 0
-    return f"{second} comes {1e3 * lead / fs:.3g} ms before {first}: are the files swapped?" if lead else None
+        return cause, every * (1 + slope)
+    return "", every
 
 
 def _unexplained(sent: np.ndarray, heard: np.ndarray) -> float:

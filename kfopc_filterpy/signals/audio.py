@@ -6,6 +6,7 @@ import io
 import os
 import shlex
 import struct
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -64,6 +65,14 @@ def read_audio(path: str | os.PathLike[str]) -> Content:
             frames = file.read(dtype="float64", always_2d=True)
         if bits is not None:
             frames *= _justified(path, frames, bits, _BYTES.get(file.subtype, 0), file.channels)
+        elif (
+            file.subtype == "PCM_32" and np.max(np.abs(frames), initial=0.0) <= 2.0**-8 and np.any(frames * 2**31 % 256)
+        ):
+            warnings.warn(
+                f"{path} has 32 bits, of which the highest 8 are not used: if it was recorded with arecord -f S24_LE, its "
+                "numbers are 48 dB too small; record it in S24_3LE or S32_LE",
+                stacklevel=2,
+            )
     if len(frames) == 0:
         raise ValueError(
             f"{path} holds no samples: its header claims zero frames, in a file of {Path(path).stat().st_size} bytes; "

@@ -56,6 +56,14 @@ def test_a_lost_block_is_told_with_its_samples_and_its_place(sent, lost, said):
     assert float(re.match(r"from about (\S+) s on, d is", fault)[1]) == pytest.approx(3, abs=1)
 
 
+def test_clocks_that_differ_show_in_a_sweep_that_is_played_twice():
+    times = np.arange(N) / FS
+    sweep = np.sin(2 * np.pi * (200 * np.mod(times, 4) + 350 * np.mod(times, 4) ** 2))  # 200 to 3000 Hz in 4 s
+    drifting = np.mod(times * (1 - 50e-6) - DELAY / FS, 4)
+    heard = 0.5 * np.sin(2 * np.pi * (200 * drifting + 350 * drifting**2))
+    assert re.search(r"the clocks differ by \+(4\d|5\d)\.\d ppm", timing_fault(sweep, heard, FS, ("x", "d")))
+
+
 def test_swapped_files_are_told(sent):
     assert timing_fault(with_clock(0), sent, FS, ("x", "d")) == "d comes 2.5 ms before x: are the files swapped?"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import warnings
 import zipfile
 
 import numpy as np
@@ -217,6 +218,20 @@ def test_samples_with_more_room_than_bits_keep_their_level(tmp_path, bits, n_byt
     (tmp_path / "x.wav").write_bytes(content)
     level = np.sqrt(np.mean(read_recording(tmp_path / "x.wav").samples ** 2))
     assert level == pytest.approx(0.1 / np.sqrt(2), rel=1e-3)  # 12 bits: steps of 0.5 % of the sine
+
+
+def test_32_bits_that_may_be_24_in_the_low_ones_are_warned_of(tmp_path):
+    """As arecord 1.2.10 and later write S24_LE; a quiet recording, or one with 24 high bits, may look similar."""
+    for samples, is_told in (
+        (low_bits(24, 4), True),
+        (low_bits(32, 4), False),
+        (low_bits(24, 4).view("<i4") // 512 * 256, False),
+    ):
+        (tmp_path / "x.wav").write_bytes(wav(np.ascontiguousarray(samples), 32, 4))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read_recording(tmp_path / "x.wav")
+        assert ["S24_LE, its numbers are 48 dB too small" in str(one.message) for one in caught] == [True] * is_told
 
 
 def test_bits_that_do_not_fit_their_block_are_refused(tmp_path):
