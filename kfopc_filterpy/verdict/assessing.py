@@ -228,7 +228,9 @@ def assess(
             n_taps=None if n_taps is None else as_count(n_taps, "n_taps"),
             max_taps=longest_filter(J * n_references),
         )
-        bounds = FixedFilters(x[..., start:], d[..., start:], s, settings.n_taps, fs)
+        margin_s = None if p is None else causality_margin(plant).margin_s
+        late = max(0, round(-(margin_s or 0.0) * fs))
+        bounds = FixedFilters(x[..., start:], d[..., start:], s, settings.n_taps, fs, late)
         official = bounds.within(limits.rated_power)
         required = bounds.needed(want_db, limits.rated_power)
     if any(issubclass(warning.category, np.exceptions.RankWarning) for warning in caught):
@@ -266,7 +268,7 @@ def assess(
         filter_db=bounds.filter_db,
         power_db=bounds.limited(limits.rated_power)[1],
     )
-    cause = None if reached >= want_db else _cause(ceilings, want_db)
+    cause = None if reached >= want_db else _cause(ceilings, want_db, late >= settings.n_taps)
     volts_per_unit, ohm = (scale_of(ratings, name, several) for name in ("volts_per_unit", "ohm"))
     watts = watt_per_power(ratings, several)
     least = np.inf if want_db else 0.0
@@ -305,7 +307,7 @@ def assess(
         unlimited_power=bounds.free.control_power,
         required_rated_power=required,
         least_rated_power=least * limits.rated_power,
-        causality_margin_s=None if p is None else causality_margin(plant).margin_s,
+        causality_margin_s=margin_s,
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
         band=_band(bounds.d, s, fs),
         levels=None if pascals is None else _levels(run, pascals),
@@ -546,12 +548,12 @@ def _on_louder_bands(run: SimulationResult) -> list[str]:
     ]
 
 
-def _cause(ceilings: Ceilings, want_db: float) -> str:
-    """Return the cause by the first ceiling that does not reach what is wanted."""
+def _cause(ceilings: Ceilings, want_db: float, is_later_than_filter: bool) -> str:
+    """Return the cause by the first ceiling that does not reach what is wanted; what comes too late needs no longer filter."""
     if ceilings.coherence_db is not None and ceilings.coherence_db < want_db:
         return "coherence"
     if ceilings.filter_db < want_db:
-        return "causality" if ceilings.time_db >= want_db else "filter"
+        return "causality" if ceilings.time_db >= want_db or is_later_than_filter else "filter"
     return "amplifier" if ceilings.power_db < want_db else "adaptation"
 
 

@@ -393,10 +393,13 @@ def advice_on(verdict: Assessment, *, fs: str = "fs=", n_taps: str = "n_taps=") 
                 f"{late} for the prediction, the same filter reaches {want}: move the loudspeaker towards the error "
                 "microphone, shorten the latency of the electronics, or add a reference microphone (hybrid control)."
             ]
+        if delay is None and (verdict.causality_margin_s or 0.0) < 0:
+            late = f"The anti-noise is {-1e3 * (verdict.causality_margin_s or 0.0):.3g} ms late"
+        else:
+            late += f" between the reference microphone and the loudspeaker, the same filter reaches {want}"
         return [
-            f"{late} between the reference microphone and the loudspeaker, the same filter reaches {want}: move the "
-            "microphone towards the source or the loudspeaker towards the error microphone, or shorten the latency of the "
-            "electronics."
+            f"{late}: move the microphone towards the source or the loudspeaker towards the error microphone, or shorten the "
+            "latency of the electronics."
         ]
     if verdict.limited_by == "filter":
         return _advice_on_length(verdict, fs, n_taps)

@@ -41,11 +41,13 @@ class FixedFilters:
         Taps of a filter.
     fs : float
         Sample rate in Hz.
+    late : int, default 0
+        Samples by which the anti-noise is late: a look-ahead to be tried beside those of the filter's length.
     """
 
     stretch: Stretch | ChannelStretch
 
-    def __init__(self, x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> None:
+    def __init__(self, x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float, late: int = 0) -> None:
         past = s.shape[-1] + n_taps - 2  # samples that fill the delay lines
         first = max(x.shape[-1] // 2 - past, 0)
         self.x, self.d, self.s, self.n_taps, self.fs = x[..., first:], d[..., first:], s, n_taps, fs
@@ -57,7 +59,7 @@ class FixedFilters:
         self.correlations: Any = self.stretch.correlations()
         self.free = self.stretch.solution(self.correlations.weights())
         self.filter_db = self.free.noise_reduction_db
-        ahead = sorted({round(share * n_taps) for share in LOOK_AHEAD} - {0})
+        ahead = sorted({round(share * n_taps) for share in LOOK_AHEAD} | {min(late, x.shape[-1] // 4)} - {0})
         self.ahead = {samples: self._ahead_db(samples) for samples in ahead}
         self.time_db = max([self.filter_db, *self.ahead.values()])
 

@@ -187,6 +187,15 @@ def test_the_advice_on_causality_is_a_delay_that_helps():
     assert verdict.causality_margin_s == pytest.approx(-10 / FS)
 
 
+def test_buffers_far_longer_than_the_filter_are_no_matter_of_its_length():
+    """As in an impulse response that holds 0.2 s of an interface's latency."""
+    verdict = on(noise(high=3500.0), arriving(20), arriving(1620, length=1700))
+    assert verdict.limited_by == "causality"
+    assert verdict.helpful_delay_s == pytest.approx(0.2)  # one tap cancels the noise, if it knows it so early
+    late = replace(verdict, helpful_delay_s=None)  # as if the noise's path were longer than the filter
+    assert advice_on(late)[0].startswith("The anti-noise is 200 ms late: move the microphone towards the source")
+
+
 # What it writes.
 
 
