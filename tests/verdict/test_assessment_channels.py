@@ -20,6 +20,7 @@ from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
 from kfopc_filterpy.signals import band_limited_noise
 from kfopc_filterpy.verdict import assess
 from kfopc_filterpy.verdict.assessment import SCHEMA
+from kfopc_filterpy.verdict.limits import limits_of
 
 FS, SECONDS, TAPS = 8000, 3.0, 32
 PLENTY = 100.0  # times what full control takes
@@ -134,6 +135,13 @@ def test_the_power_for_6_db_is_that_of_the_closed_form_and_the_amplifiers_are_th
     assert "each" in small.verdict
     large = on(rating=1.02 * small.least_rated_power)
     assert (large.enough, large.limited_by, large.reason) == (True, None, "")
+
+
+def test_all_limiters_have_the_shortest_window_of_the_ratings():
+    cone, amplifier = LoudspeakerRating(8.0, noise_watt=1.0), AmplifierRating(ohm=8.0, sine_watt=1.0)
+    limits = limits_of([[cone], [amplifier]], several=True)
+    assert [one.window_s for one in limits.each] == [amplifier.limits.window_s] * 2
+    assert amplifier.limits.window_s < cone.limits.window_s
 
 
 def test_one_weak_amplifier_is_the_cause_if_the_others_cannot_take_over():
