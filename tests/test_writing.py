@@ -175,14 +175,14 @@ sys.exit(__main__.main())
 
 @pytest.mark.parametrize("renames", [1, 3], ids=["the old page is aside", "new files are in their places"])
 def test_an_interrupted_verdict_leaves_the_folder_as_it_was(renames, tmp_path):
-    noise = np.random.default_rng(0).standard_normal(4 * FS)
+    noise = np.random.default_rng(0).standard_normal(5 * FS // 2)
     for name, samples in {"noise": noise, "P": np.eye(64)[26], "S": np.eye(64)[12]}.items():
         write_wav(tmp_path / f"{name}.wav", samples, FS)
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "verdict.html").write_text("an older page")
     before = contents(tmp_path)
     command = [sys.executable, "-c", INTERRUPTED, str(renames)]
-    command += ["verdict", *SCENE, "--rated-power", "4", "--taps", "32", "-o", "out", "--quiet"]
+    command += ["verdict", *SCENE, "--rated-power", "4", "--taps", "16", "-o", "out", "--quiet"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 130, done
