@@ -6,7 +6,7 @@ import argparse
 import csv
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,41 +20,26 @@ if TYPE_CHECKING:
 COLUMNS = ("name", "watt", "ohm", "price")
 
 
-class Amplifier(NamedTuple):
-    """A line of the list: the rated power in W, the load in ohm that it was measured with, and the price."""
-
-    name: str
-    watt: float
-    ohm: float
-    price: float
-
-
-def amplifiers_in(path: str) -> list[Amplifier]:
-    """Return the amplifiers of a CSV file, by price."""
+def amplifiers_in(path: str) -> list[list[Any]]:
+    """Return the amplifiers of a CSV file by price: name, rated power in W, the load in ohm it was measured with, price."""
     from ..signals.content import require_file
 
     require_file(path)
     lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    delimiter = ";" if ";" in lines[0] else ","
-    rows = csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True)
-    headings = {
-        column: next((one for one in rows.fieldnames or () if one.lower().startswith(column)), "") for column in COLUMNS
-    }
-    if not all(headings.values()):
-        raise ValueError(f"{path} must begin with the headings {', '.join(COLUMNS)}, got {lines[0]!r}")
-    found = []
-    for row in rows:
-        name, *texts = (row[headings[column]] or "" for column in COLUMNS)
-        try:
-            numbers = [float(text.replace(",", ".") if delimiter == ";" else text) for text in texts]
-        except ValueError as error:
-            raise ValueError(
-                f"{path}, line {rows.line_num}: watt, ohm and price must be numbers, got {texts}"
-            ) from error
-        found.append(Amplifier(name, *numbers))
+    comma = "," if ";" in lines[0] else "."  # of decimals
+    try:
+        rows = [
+            [cell.strip() for cell in row] for row in csv.reader(lines, delimiter=";" if comma == "," else ",") if row
+        ]
+        places = [next(i for i, one in enumerate(rows[0]) if one.lower().startswith(column)) for column in COLUMNS]
+        found = [[row[places[0]], *(float(row[i].replace(comma, ".")) for i in places[1:])] for row in rows[1:]]
+    except (StopIteration, IndexError, ValueError) as error:
+        raise ValueError(
+            f"{path} must have the headings {', '.join(COLUMNS)}, and a number in the last three of each line: {error}"
+        ) from error
     if not found:
         raise ValueError(f"{path} lists no amplifier below its headings")
-    return sorted(found, key=lambda one: one.price)
+    return sorted(found, key=lambda one: one[3])
 
 
 def cheapest_enough(
@@ -70,19 +55,18 @@ def cheapest_enough(
     refuse_unused(options, ("watt", "ohm", "peak_volts", "rated_power"), ": --amplifiers has a column for it")
     listed = amplifiers_in(options.amplifiers)
     ratings = [
-        ratings_of(argparse.Namespace(**vars(options) | {"watt": [one.watt], "ohm": [one.ohm]}), n_loudspeakers)
-        for one in listed
+        ratings_of(argparse.Namespace(**vars(options) | {"watt": [watt], "ohm": [ohm]}), n_loudspeakers)
+        for _, watt, ohm, _ in listed
     ]
-    several = n_loudspeakers > 1
-    powers = [float(np.min(limits_of(ratings_of_each(one, n_loudspeakers), several).rated_power)) for one in ratings]
+    limits = [limits_of(ratings_of_each(one, n_loudspeakers), n_loudspeakers > 1) for one in ratings]
+    powers = [float(np.min(one.rated_power)) for one in limits]
     largest = int(np.argmax(powers))
-    found = assessed(ratings[largest])
-    least = powers[largest] * float(np.max(found.least_rated_power / found.limits.rated_power))
+    found = first = assessed(ratings[largest])
+    least = powers[largest] * float(np.max(first.least_rated_power / first.limits.rated_power))
     order = sorted(range(len(listed)), key=lambda k: powers[k] < least)  # stable: by price within each
-    for k in order:
-        if powers[k] >= least and k != largest:
-            found = assessed(ratings[k])
-        if found.enough or powers[k] < least:
+    for k in order[: sum(power >= least for power in powers)]:
+        found = first if k == largest else assessed(ratings[k])
+        if found.enough:
             break
     spare_db = [round(float(10 * np.log10(power / least)), 1) if least else np.inf for power in powers]
     rows = [[*listed[k], "yes" if powers[k] >= least else "no", spare_db[k]] for k in order]

@@ -111,8 +111,8 @@ def test_of_a_list_of_amplifiers_the_cheapest_that_is_enough_is_first(command, f
 @pytest.mark.parametrize(
     ("text", "more", "message"),
     [
-        ("name,watt,price\na,1,1\n", [], "list.csv must begin with the headings name, watt, ohm, price, got"),
-        ("name,watt,ohm,price\na,1,8,?\n", [], "list.csv, line 2: watt, ohm and price must be numbers, got"),
+        ("name,watt,price\na,1,1\n", [], "list.csv must have the headings name, watt, ohm, price, and a number"),
+        ("name,watt,ohm,price\na,1,8,?\n", [], "each line: could not convert string to float: '?'"),
         ("name,watt,ohm,price\n", [], "list.csv lists no amplifier"),
         (
             "name,watt,ohm,price\na,1,8,1\n",
