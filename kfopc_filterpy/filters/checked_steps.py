@@ -249,7 +249,7 @@ def as_covariance(value: Any, size: int, name: str) -> np.ndarray:
             f"{name} must be symmetric, but [{i}, {j}] holds {matrix[i, j]:g} and [{j}, {i}] {matrix[j, i]:g}"
         )
     require_semidefinite(matrix, name)
-    return 0.5 * matrix + 0.5 * matrix.T
+    return matrix
 
 
 def require_semidefinite(value: ArrayLike, name: str) -> None:

@@ -250,7 +250,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         Q: ArrayLike | None = None,
     ) -> None:
         """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
-        if not checked_steps.is_usual_prediction(self, F, Q):
+        if isinstance(u, np.ma.MaskedArray) or not checked_steps.is_usual_prediction(self, F, Q):
             u, B, F, Q = checked_steps.checked_prediction(self, u, B, F, Q)
         if self._constraint is not None:
             self._require_random_walk(self.F if F is None else F)
@@ -322,7 +322,8 @@ class KFOPC(KalmanFilter, Checkpointed):
         """Run filterpy's `predict_steadystate`; arguments that would corrupt the filter raise an error first."""
         if self._constraint is not None:
             self._require_random_walk(self.F)
-        self._all_or_nothing(super().predict_steadystate, checked_steps.require_control, u, B)
+        checked_steps.require_control(self, u, B)
+        self._all_or_nothing(super().predict_steadystate, None, u, B)
         self._moved = self._moved or self._has_input(u, B)
 
     def update_steadystate(self, z: ArrayLike | None, *, reference: ArrayLike | None = None) -> None:
@@ -773,7 +774,8 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     def _has_input(self, u: Any, B: Any) -> bool:
         """Return whether a control input moves the state."""
-        return u is not None and (self.B if B is None else B) is not None and bool(np.any(u))
+        given = u is not None and (self.B if B is None else B) is not None
+        return given and (np.ma.is_masked(u) or bool(np.any(u)))  # a masked input is refused, not left out
 
     def _require_whole(self) -> None:
         """Raise an error if attributes were put back without what steps write in place (`_in_place`).

@@ -133,7 +133,7 @@ class Twins(RuleBasedStateMachine):
         rng = np.random.default_rng(seed)
         for seed in rng.integers(2**32, size=samples):
             kept, prediction, between, correction, after = (
-                str(rng.choice(some)) for some in (["", "", "x", "P"], PREDICTIONS, USES, CORRECTIONS, USES)
+                str(rng.choice(some)) for some in (["", "", "x", "P", "K"], PREDICTIONS, USES, CORRECTIONS, USES)
             )
             form = int(rng.integers(13))
             note(f"{seed=}, {kept=}, {prediction=}, {between=}, {correction=}, {form=}, {after=}")

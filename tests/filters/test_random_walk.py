@@ -135,6 +135,22 @@ def test_the_state_noise_is_what_was_given_however_small() -> None:
     assert kf.P[0, 0] - 1.0 == pytest.approx(1e-7, rel=1e-7)
 
 
+def test_what_is_nothing_but_rounding_moves_nothing() -> None:
+    kf, rng = KFOPC.random_walk(3, state_noise=0.0, measurement_noise=0.0), np.random.default_rng(0)
+    rows = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    for k in range(8):  # until the least state noise is more than rounding
+        kf.predict()
+        kf.update(rng.normal(), H=rows[k % 2])  # the first two are known exactly; the others contradict them
+        assert abs(rows[2] @ kf.x) < 1e-12
+
+
+def test_a_variance_of_long_ago_refuses_no_noise() -> None:
+    kf = KFOPC.random_walk(1, state_noise=0.0, measurement_noise=1.0, initial_variance=1.5e308)
+    kf.update(1.0, H=[1e-100])
+    kf.predict(Q=1e308)
+    assert kf.P.item() == pytest.approx(1e308)
+
+
 def test_without_any_noise_what_is_known_exactly_tells_nothing() -> None:
     kf = KFOPC.random_walk(3, state_noise=0.0, measurement_noise=0.0)
     rows = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
@@ -166,6 +182,11 @@ def test_a_write_into_F_Q_R_is_refused_and_numbers_are_taken(name: str) -> None:
             setattr(kf, name, 1.0)
             setattr(kf, name, value)
             np.testing.assert_array_equal(getattr(kf, name), 0.3 * np.eye(len(matrix)))
+    own = 0.3 * np.eye(len(matrix))
+    setattr(kf, name, own)
+    own[0, 0] = 7.0  # the filter has a copy
+    assert getattr(kf, name)[0, 0] == 0.3
+    kf.F = np.eye(3)
     kf.Q = np.diag([1.0, 2.0, 3.0])
     kf.Q[0, 0] = 2.0
     kf.P = 1.0

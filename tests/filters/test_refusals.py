@@ -127,6 +127,7 @@ OTHER_STEPS = {
     "f.predict(u=ones((1, 1)), B=ones((6, 1)))": r"predict: .*\(shapes: .*'B': \(6, 1\)",
     "f.predict(u=ones((1, 3)), B=ones((5, 1)))": "x would become",
     "f.predict_steadystate(u=nan, B=ones((5, 1)))": "u must be finite",
+    "f.predict_steadystate(u=np.ma.masked_all((1, 1)), B=ones((5, 1)))": "u must be finite",
     "f.predict_steadystate(u=ones((2, 1)), B=ones((5, 1)))": r"predict_steadystate: .*\(shapes: .*'u': \(2, 1\)",
     "f.get_prediction(u=ones((1, 3)), B=ones((5, 1)))": "x would become",
     "f.get_prediction(Q=ones(5))": "Q must have shape",
