@@ -13,6 +13,7 @@ import numpy as np
 from .content import LEAST_SURE_RATE, NO_SIGNAL, Content, agreed_rate, even_step, rate_of_step, rounding_of
 
 _LONGEST_HEADER = 100  # lines
+_LONGEST_STATEMENT = 500  # characters of a line, in which a rate is looked for
 _END, _ENOUGH = 4096, 20  # bytes and lines at the end by which a file that was cut is recognised
 _TEKTRONIX = re.compile(
     r'"?Record Length"?(,[^,]*){4}'
@@ -84,7 +85,7 @@ def read_text(path: str | os.PathLike[str]) -> Content:
 def _stated_rate(path: str | os.PathLike[str], header: list[str]) -> float | None:
     """Return the rate in Hz that a header names, None if it names none."""
     for kind, stated in _STATED.items():
-        for found in filter(None, map(stated.search, header)):
+        for found in filter(None, (stated.search(line[:_LONGEST_STATEMENT]) for line in header)):
             short, before, unit_before, number, after, unit_after = found.groups()
             plain = number.replace(",", "" if re.fullmatch(r"\d+(,\d{3})+", number) else ".").rstrip(".")
             value = float(plain) * _PREFIXES[(before or after or "").lower()]

@@ -154,3 +154,9 @@ def test_channels_that_do_not_fit_are_refused(command, several, arguments, messa
     code, _, err = command("verdict", "noise.wav", *arguments.split(), "--fs", FS, "--quiet")
     assert code == 2
     assert message in err
+
+
+def test_without_arguments_the_command_shows_its_help(command):
+    code, out, err = command()
+    assert (code, err) == (0, "")
+    assert out.startswith("usage: kfopc")
