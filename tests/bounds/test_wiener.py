@@ -10,6 +10,7 @@ from helpers.channels import delayed
 from kfopc_filterpy import Plant
 from kfopc_filterpy._taps import path_taps
 from kfopc_filterpy.bounds import coherence_bound, wiener_solution
+from kfopc_filterpy.bounds.power_constrained import power_constrained_solution, power_constrained_wiener
 from kfopc_filterpy.paths import duct_plant
 from kfopc_filterpy.paths.least_squares import correlation_matrix
 from kfopc_filterpy.paths.models import bandpass_path
@@ -137,6 +138,15 @@ def test_a_narrow_band_reference_warns_that_larger_weights_do_better():
     told = float(re.search(r"lower the error by (\d+\.\d) dB", str(caught[0].message))[1])
     # The warning compares evenly spaced samples, and leaves out the smallest directions by its own measure.
     assert told == pytest.approx(reached - found.noise_reduction_db, abs=6)
+
+
+def test_the_bounds_within_a_power_warn_too():
+    x, d, plant = narrow()
+    with pytest.warns(np.exceptions.RankWarning, match="no bound"):
+        free = wiener_solution(x, plant, n_taps=64, disturbance=d).control_power
+    for bound, options in ((power_constrained_solution, {}), (power_constrained_wiener, {"switch_on_s": 0.1})):
+        with pytest.warns(np.exceptions.RankWarning, match="no bound"):
+            bound(x, plant, n_taps=64, rated_power=2 * free, disturbance=d, **options)
 
 
 def test_what_the_cut_does_not_change_does_not_warn():
