@@ -283,8 +283,7 @@ class RandomWalkKFOPC(KFOPC):
         """Take over a P that was written into or assigned since the last step."""
         P = self.__dict__.get("P")
         if P is not None and not np.array_equal(P, self._full(self._scale, self._diagonal)):
-            _ = self.P_prior, self.P_post  # of the P before
-            super()._take_in_edits()
+            super()._take_in_edits()  # reads, and so makes, P_prior and P_post of the P before
             self._triangle, self._scale, self._diagonal = np.array(P), 1.0, 0.0
             self._bound, self._predicted = self._largest_variance(), False
 

@@ -5,6 +5,7 @@ That it does what filterpy does, step for step, is tested in `test_against_filte
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import mpmath
@@ -194,3 +195,7 @@ def test_a_write_into_F_Q_R_is_refused_and_numbers_are_taken(name: str) -> None:
     np.testing.assert_array_equal(kf.P, np.diag([3.0, 3.0, 4.0]))
     kf.Q = 0.1
     np.testing.assert_array_equal(kf.Q, 0.1 * np.eye(3))
+    twin = copy.deepcopy(kf)
+    twin.Q[0, 0] = 2.0  # a copy's can be written into, and that counts
+    twin.predict()
+    assert twin.P[0, 0] == kf.P[0, 0] + 2.0
