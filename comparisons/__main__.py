@@ -32,7 +32,17 @@ ALONE = {  # with options of their own
 STUDIES = {name: _study(name) for name in ("tonal", "broadband", "duct")}
 MEASURED: dict[str, Study] = {name: (partial(duct.measured, name=name), duct.planned_runs) for name in duct.MEASURED}
 STUDIES["duct-measured"] = MEASURED.pop("duct-measured")
-BEYOND_THE_PAPER = ["ways", "constraint", "kf_pb", "loss_map", "rated_powers", "mismatch", "uncertain_path", "tracking"]
+BEYOND_THE_PAPER = [
+    "ways",
+    "constraint",
+    "kf_pb",
+    "events",
+    "loss_map",
+    "rated_powers",
+    "mismatch",
+    "uncertain_path",
+    "tracking",
+]
 BEYOND_THE_PAPER += ["amplifier", "multichannel"]
 FURTHER = {f"{name}-authors": _study(name, "authors") for name in ("tonal", "broadband")} | MEASURED
 FURTHER |= {name: _study(name) for name in BEYOND_THE_PAPER}
