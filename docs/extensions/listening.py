@@ -77,7 +77,7 @@ def scene() -> dict[str, Any]:
     for fs in RATES:
         of_budget = settings_of(kf_pb(TAPS, plant.secondary[0, 0], rated_power=1.0, fs=fs))
         constrained = kf_opc(TAPS, plant.secondary[0, 0], rated_power=1.0, fs=fs, **NOISES)
-        rates[fs] = {name: of_budget[name] for name in ("block", "averaging", "window")}
+        rates[fs] = {name: of_budget[name] for name in ("block", "averaging", "window", "memory")}
         rates[fs]["rate"] = float(constrained._block.fields["constraint"].ravel()[1])
     return {
         "fs": FS,

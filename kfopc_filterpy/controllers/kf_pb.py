@@ -21,7 +21,9 @@ DEFAULT_AVERAGING_S = 10.0
 LEAST_BLOCKS, MOST_BLOCKS = 20, 100_000  # in the averaging time
 DEFAULT_UNCERTAINTY = 0.3  # relative rms error of a secondary path
 LEAST_SPREAD, MOST_SPREAD = 1e-4, 1e3  # of a path that is not exact
+WINDOWS, WINDOW_S = 8, 1.25  # windows of the references in the averaging time, and a window's longest time constant
 BLOCK_S = 0.032  # from one posterior to the next, at least
+MEMORY_S = 5.0  # time constant of what is known of the plant: it follows a drift of a tenth of the path in a second
 # What is known about the plant: fields of the core's posterior.
 POSTERIOR = (
     *(
@@ -142,11 +144,10 @@ def kf_pb(
     `averaging_s`, the mean power is kept to the rated power (what goes beyond 1.04 times is clipped), and what is left
     over in a quiet time can be spent in a louder one. Power is not spent where a whole rating of it would save less than half of the measurement noise.
 
-    The secondary path is verified while it is used. If the errors contradict the posterior, an alarm resets it to the
-    given path with a large uncertainty. The loudspeakers play little until the path has been learned again. If no
-    secondary path explains the errors half a second later, the primary path has changed, and both are learned anew. If
-    a new `secondary` is assigned, the whole posterior begins anew, including that of the primary paths. The
-    account stays, and the control filter stays until the first solution.
+    Both paths are verified while they are used. If the errors contradict the posterior, the plant has changed, and all
+    that was learned is forgotten. If the control then does more harm than good, the loudspeakers are silent until both
+    paths are learned again: one or two blocks for short paths. If a new `secondary` is assigned, the posterior begins
+    anew, too. The account stays, and the control filter stays until the first solution.
 
     Parameters
     ----------
@@ -189,16 +190,17 @@ def kf_pb(
 
     Notes
     -----
-    The posterior is computed again when an eighth of the data is new, or earlier if the error is large. This takes
+    The posterior is computed again when an eighth of the data is new, or of the energies in it. This takes
     :math:`O((IN + JM)^3)` operations, which are spread over as many blocks as they need; a secondary path has M taps,
-    and a primary one N = L + M - 1. The posterior forgets over twice `averaging_s`. `listen` learns the primary paths
+    and a primary one N = L + M - 1. The posterior forgets over 5 s. `listen` learns the primary paths
     before the control is switched on.
 
     References
     ----------
     S. M. Kay, "Fundamentals of statistical signal processing: estimation theory", 1993, section 12.5, for the
     posterior. S. J. Elliott, "Signal processing for active control", 2001, section 3.4, for the filter at a price of
-    its power. The account and the alarm are the package's.
+    its power. W. James, C. Stein, "Estimation with quadratic loss", 1961, for what is significant. The account and the
+    surprise are the package's.
 
     Examples
     --------
@@ -230,7 +232,8 @@ def kf_pb(
             "rated_power": rated_power,
             "block": block,
             "averaging": max(round(samples / block), LEAST_BLOCKS),
-            "window": math.exp(-1.0 / samples),
+            "window": math.exp(-1.0 / min(samples / WINDOWS, WINDOW_S * fs)),
+            "memory": math.exp(-block / (MEMORY_S * fs)),
             "spread": relative_spread(secondary_path_uncertainty, paths),
         },
         n_references=n_references,

@@ -11,27 +11,34 @@
  * primary path are all that control can reach; `lags` is L + N. C_ab(l) = E[a(t) b(t - l)]. */
 #include "posterior.h"
 
-enum { RATED_POWER, BLOCK, AVERAGING, WINDOW, SPREAD };
+enum { RATED_POWER, BLOCK, AVERAGING, WINDOW, MEMORY, SPREAD };
 static const anc_setting budget_settings[] = {{"rated_power", 1e-30f, 0, ANC_EACH_LOUDSPEAKER},
                                               {"block", 1, 65536, ANC_ONE},
                                               {"averaging", 20, 100000, ANC_ONE},
                                               {"window", 0, 1, ANC_ONE},
+                                              {"memory", 0, 1, ANC_ONE},
                                               {"spread", 0, 1000, ANC_ONE},
                                               {0}};
 
-/* If nothing of the account is spent, the price falls to (1 - ACCOUNT)^16 = 0.01 of itself. */
-static const real ACCOUNT = 0.25f;
+/* What is left of the account makes power cheaper by this many times its share, so that steady
+ * noises spend all of it; at the cheapest, the price is this part of itself, so that a noise that
+ * has become loud does not spend at once what it needs for long. */
+static const real CHEAPER = 4, CHEAPEST = (real)0.7;
 /* A rating of power must save at least this share of the noise. */
 static const real WORTHWHILE = 0.5f;
 /* Of the power that a price is to yield. */
 static const real NEAR = (real)0.005;
 /* Shares of the account: what a filter may always spend; what is never exceeded, but clipped. */
 static const real LEAST_SHARE = (real)0.02, MOST = (real)1.04;
-/* What lasted t may go on for twice as long, and for at least a twentieth of the averaging time. */
-enum { SCALES = 3, TWICE = 2, SHORTEST = 20 };
-/* t: exponential windows of the averaging time over these. The filter is solved for the references
- * of the first. */
-static const int32_t SCALE[SCALES + 1] = {8, 100, 40, 4};
+/* The account must afford the power of the last window of x for this part of the averaging time,
+ * and that of the last block for this one. */
+enum { WINDOW_LASTS = 4, BLOCK_LASTS = 20 };
+/* The level of x is that of an exponential window which is so much shorter than that of its
+ * spectrum: a spectrum needs many samples, a level few. */
+enum { SHORTER = 5 };
+/* A sound does not grow by more than this from one sample to the next, but a click in a reference
+ * does. */
+static const real GROWTH = 10;
 enum { NEWTON = 20 }; /* steps */
 /* No filter has a larger tap. REGULAR: share of the diagonal that is added to it, so that rounding
  * leaves the matrix definite. */
@@ -46,11 +53,12 @@ typedef struct {
     posterior posterior;
     int32_t T, lags;       /* T: blocks of the account */
     real *asked;           /* (3, J) now; sum of squares of the block; the most it may become */
+    real *peak;            /* (I) largest magnitude of x of late */
     int32_t *controlled;   /* whether control was on in the block */
-    real *R, *short_R;     /* (I, I, lags), (SCALES, I, I, L) windowed sums of x_i(t) x_a(t - l) */
-    real *weight;          /* (1 + SCALES) of these windows */
+    real *R, *short_R;     /* (I, I, lags), (I, I, L) windowed sums of x_i(t) x_a(t - l) */
+    real *weight;          /* (2) of these windows */
     real *book;            /* (T, J) power of each block over the rating, newest first */
-    real *price, *steady;  /* (J); (2, J) the price that spends the rating, and as it is held */
+    real *price, *steady;  /* (J); (J) the price that spends the rating */
     real *C;               /* (I, I, 2 lags - 1) of the references, both signs of l */
     real *A;               /* (J, I, J, I, 2L - 1) of the filtered references */
     real *b;               /* (J, I, L) of these with d */
@@ -64,7 +72,7 @@ typedef struct {
 typedef char budget_fits_into_a_view[sizeof(budget) <= sizeof(anc_view) ? 1 : -1];
 
 enum { REST, SOLUTION, PLAYED, VECTORS_OF_TAPS };
-enum { WORKS = SCALES + 2 };
+enum { WORKS = 3 };
 
 /* Layout. */
 
@@ -90,7 +98,7 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     const int32_t J = plan->loudspeakers;
     const real *own = plan->settings ? plan->settings + J : NULL; /* after the rated powers */
     const real block = own ? own[BLOCK - 1] : 1,
-               averaging = own ? own[AVERAGING - 1] : (real)SHORTEST;
+               averaging = own ? own[AVERAGING - 1] : (real)BLOCK_LASTS;
     if (!takes(plan, block, averaging)) {
         at->size = SIZE_MAX;
         return;
@@ -101,13 +109,14 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     f->lags = lags;
     f->width = 2 * lags + f->posterior.B;
     f->asked = reals(at, "asked", ANC_STATE, 1, 1, 3, J);
+    f->peak = reals(at, "reference_peak", ANC_STATE, 1, 1, 1, I);
     f->controlled = int32s(at, "controlled", ANC_STATE, 1);
     f->R = reals(at, "reference_correlation", ANC_STATE, 1, I, I, lags);
-    f->short_R = reals(at, "short_correlations", ANC_STATE, SCALES, I, I, L);
-    f->weight = reals(at, "window_weights", ANC_STATE, 1, 1, 1, 1 + SCALES);
+    f->short_R = reals(at, "short_correlation", ANC_STATE, 1, I, I, L);
+    f->weight = reals(at, "window_weights", ANC_STATE, 1, 1, 1, 2);
     f->book = reals(at, "book", ANC_STATE, 1, 1, f->T, J);
     f->price = reals(at, "price", ANC_STATE, 1, 1, 1, J);
-    f->steady = reals(at, "steady_price", ANC_STATE, 1, 1, 2, J);
+    f->steady = reals(at, "steady_price", ANC_STATE, 1, 1, 1, J);
     f->C = reals(at, "two_sided", ANC_SCRATCH, 1, I, I, 2 * lags - 1);
     f->A = reals(at, "filtered_correlation", ANC_SCRATCH, J * I, J, I, 2 * L - 1);
     f->b = reals(at, "with_disturbance", ANC_SCRATCH, 1, J, I, L);
@@ -369,43 +378,30 @@ static real price_of(const toeplitz_system *t, real power, real start, real *v)
 
 /* The references. */
 
-/* The windowed sums of x_i(t) x_a(t - l), of one of the scales. */
-static real *window_of_references(const budget *f, int32_t scale, int32_t i, int32_t a)
-{
-    const int32_t I = f->s.I;
-    if (scale == 0) return f->R + times(i * I + a, f->lags);
-    return f->short_R + times(((scale - 1) * I + i) * I + a, f->s.L);
-}
+/* The factor of the short window, a sample. */
+static real short_window(const budget *f) { return raised(*f->s.setting[WINDOW], SHORTER); }
 
-/* Add the block to the windows of the references; x is zero before the first, so they are positive
- * definite. */
-static void take_references(budget *f)
+/* Add the block to a window of the references, (I, I, lags), and to its weight; x is zero before
+ * the first, so the sums are positive definite. */
+static void take_references(const budget *f, real *sums, int32_t lags, real g, real *weight)
 {
-    const int32_t I = f->s.I, L = f->s.L, B = f->posterior.B;
-    real g[SCALES + 1], fade[SCALES + 1];
-    for (int c = 0; c <= SCALES; c++) {
-        g[c] = raised(*f->s.setting[WINDOW], SCALE[c]);
-        fade[c] = raised(g[c], B);
-    }
+    const int32_t I = f->s.I, B = f->posterior.B;
+    const real fade = raised(g, B);
+    real *windowed = work_row(f, 0), *more = work_row(f, 1);
     for (int32_t i = 0; i < I; i++) {
         const real *u = history_of(&f->posterior, i);
-        real share[SCALES + 1] = {1, 1, 1, 1}, sum[SCALES + 1] = {0};
-        for (int32_t t = 0; t < B; t++)
-            for (int c = 0; c <= SCALES; c++) {
-                work_row(f, c)[t] = share[c] * u[t];
-                sum[c] += share[c];
-                share[c] *= g[c];
-            }
-        for (int c = 0; c <= SCALES; c++) {
-            const int32_t lags = c ? L : f->lags;
-            real *sums = work_row(f, WORKS - 1);
-            for (int32_t a = 0; a < I; a++) {
-                real *restrict R = window_of_references(f, c, i, a);
-                correlate(sums, work_row(f, c), B, history_of(&f->posterior, a), lags);
-                for (int32_t l = 0; l < lags; l++) R[l] = faded(R[l], fade[c], sums[l]);
-            }
-            if (i == 0) f->weight[c] = fade[c] * f->weight[c] + sum[c];
+        real share = 1, all = 0;
+        for (int32_t t = 0; t < B; t++) {
+            windowed[t] = share * u[t];
+            all += share;
+            share *= g;
         }
+        for (int32_t a = 0; a < I; a++) {
+            real *restrict R = sums + times(i * I + a, lags);
+            correlate(more, windowed, B, history_of(&f->posterior, a), lags);
+            for (int32_t l = 0; l < lags; l++) R[l] = faded(R[l], fade, more[l]);
+        }
+        if (i == 0) *weight = fade * *weight + all;
     }
 }
 
@@ -413,7 +409,7 @@ static void take_references(budget *f)
 static void correlate_references(budget *f)
 {
     const int32_t I = f->s.I, lags = f->lags;
-    const real g = root(raised(*f->s.setting[WINDOW], SCALE[0])), weight = *f->weight;
+    const real g = root(*f->s.setting[WINDOW]), weight = *f->weight;
     for (int32_t i = 0; i < I; i++)
         for (int32_t a = 0; a < I; a++) {
             const real *R = f->R + times(i * I + a, lags), *other = f->R + times(a * I + i, lags);
@@ -428,15 +424,6 @@ static void correlate_references(budget *f)
 
 /* The account. */
 
-/* Return TWICE T / scale, rounded to the nearest, halves to the even one, and at least `least`. */
-static int32_t lasting(int32_t T, int32_t scale, int32_t least)
-{
-    const int32_t whole_blocks = TWICE * T / scale, rest = TWICE * T % scale;
-    const int up = 2 * rest > scale || (2 * rest == scale && whole_blocks % 2);
-    const int32_t rounded = whole_blocks + up;
-    return rounded > least ? rounded : least;
-}
-
 /* Return the mean power of the filter v in the present block. */
 static real power_of_block(const budget *f, const real *v)
 {
@@ -450,51 +437,45 @@ static real power_of_block(const budget *f, const real *v)
     return dot(y, y, B) / (real)B;
 }
 
-/* Add the powers of the filter v for the references of the short windows to power[1] to
- * power[SCALES]: E[y^2] = sum_l (v_i ~ v_a)(l) C_ia(l), with both signs of l in the two orders of i
- * and a. */
-static void add_powers(const budget *f, const real *v, real *power)
+/* Return the mean power of the filter v over the short window:
+ * E[y^2] = sum_l (v_i ~ v_a)(l) C_ia(l), with both signs of l in the two orders of i and a. */
+static real power_of_now(const budget *f, const real *v)
 {
     const int32_t I = f->s.I, L = f->s.L;
-    real *part = work_row(f, 1), *wide = work_row(f, 2);
+    const real g = root(short_window(f));
+    real *part = work_row(f, 1), *wide = work_row(f, 2), power = 0;
     for (int32_t a = 0; a < I; a++) {
         copy(wide, v + times(a, L), (size_t)L);
         clear(wide + L, (size_t)L);
         for (int32_t i = 0; i < I; i++) {
+            const real *R = f->short_R + times(i * I + a, L);
+            real taper = 1, sum = 0;
             correlate(part, v + times(i, L), L, wide, L); /* sum_m v_a(m + l) v_i(m) */
-            for (int32_t c = 1; c <= SCALES; c++) {
-                const real *R = window_of_references(f, c, i, a);
-                const real g = raised(root(*f->s.setting[WINDOW]), SCALE[c]);
-                real taper = g, sum = 0;
-                for (int32_t l = 1; l < L; l++) {
-                    sum += taper * R[l] * part[l];
-                    taper *= g;
-                }
-                power[c] += (part[0] * R[0] + 2 * sum) / f->weight[c];
+            for (int32_t l = 0; l < L; l++) {
+                sum += (real)(l ? 2 : 1) * taper * R[l] * part[l];
+                taper *= g;
             }
+            power += sum;
         }
     }
+    return power / f->weight[1];
 }
 
-/* Return the largest factor on the power of filter v that loudspeaker j's account can afford. What
- * lasted t is expected to go on for twice as long, for every t: for n blocks, with the mean power
- * over t. `taken` is that of the first scale. */
-static real affordable(const budget *f, int32_t j, const real *v, real taken)
+/* Return the largest factor on the power of filter v that loudspeaker j's account can afford, if
+ * its noise goes on for a time: that of the window of x, for which it takes `power`, and that of
+ * the last block. */
+static real affordable(const budget *f, int32_t j, const real *v, real power)
 {
-    const int32_t T = f->T, least = T / SHORTEST;
-    const real rated = f->s.setting[RATED_POWER][j];
-    real power[SCALES + 2] = {taken}, factor = 0;
-    int32_t blocks[SCALES + 2];
-    for (int c = 0; c <= SCALES; c++) blocks[c] = lasting(T, SCALE[c], least);
-    add_powers(f, v, power);
-    blocks[SCALES + 1] = least;
-    power[SCALES + 1] = power_of_block(f, v);
-    for (int c = 0; c < SCALES + 2; c++) {
+    const int32_t T = f->T, blocks[2] = {T / WINDOW_LASTS, T / BLOCK_LASTS};
+    const real powers[2] = {power, power_of_block(f, v)};
+    real factor = 0;
+    for (int c = 0; c < 2; c++) {
         const real n = (real)blocks[c];
         const real spent =
             spent_by(f, j, T - blocks[c]); /* and in the account after n blocks, too */
         const real left = larger((real)T - spent, LEAST_SHARE * n);
-        const real afforded = left / n * rated / larger(power[c], LEAST_POWER);
+        const real rated = f->s.setting[RATED_POWER][j];
+        const real afforded = left / n * rated / larger(powers[c], LEAST_POWER);
         if (c == 0 || afforded < factor) factor = afforded;
     }
     return factor;
@@ -506,8 +487,7 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const size_t row = (size_t)(2 * L - 1), row_C = (size_t)(2 * f->lags - 1);
     const real rated = f->s.setting[RATED_POWER][j];
-    const real slow = root(raised(*f->s.setting[WINDOW], f->posterior.B));
-    real *v = taps_of(f, SOLUTION), account = 1 - ACCOUNT * larger(left, 0), q = 0;
+    real *v = taps_of(f, SOLUTION), q = 0;
     toeplitz_system t = {
         .f = f,
         .A = f->A + times(j * I * J + j, I) * row,
@@ -524,15 +504,19 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
         const real *R = t.R + (t.row_R + t.next_R) * (size_t)i;
         t.scale = A[L - 1] / larger(R[L - 1], LEAST_POWER);
     }
-    /* 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly. */
-    f->steady[j] = price_of(&t, rated, f->steady[j], v);
-    f->steady[J + j] = larger(f->steady[j], f->steady[J + j] * slow);
-    /* 3 What the account holds makes power cheaper, but none that saves little of the noise. */
-    for (int n = 0; n < 4; n++) account *= account;
+    /* 1 The price at which the filter spends the rating, for the spectrum of the window of x and
+     * the level of the shorter one, which the last filter tells. */
+    const real *last = weights_of(&f->s, j);
+    multiply_toeplitz(f, taps_of(f, PLAYED), t.R, t.row_R, t.next_R, last);
+    const real usual = dot(last, taps_of(f, PLAYED), I * L), now = power_of_now(f, last);
+    const real level = usual > 0 && now > 0 ? now / usual : 1;
+    f->steady[j] = price_of(&t, rated / level, f->steady[j], v);
+    /* 2 What the account holds makes power cheaper, but none that saves little of the noise. */
     for (int32_t k = 0; k < f->s.K; k++) q += f->posterior.q[k];
-    real price = larger(f->steady[J + j] * account, WORTHWHILE * q / (rated * (real)J));
+    const real cheaper = larger(1 - CHEAPER * larger(left, 0), CHEAPEST);
+    real price = larger(f->steady[j] * cheaper, WORTHWHILE * q / (rated * (real)J));
     const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
-    /* 4 The account must afford it. */
+    /* 3 The account must afford it. */
     const real factor = power > 0 ? affordable(f, j, v, power) : 1;
     if (factor < 1) price = price_of(&t, factor * power, price, v);
     f->price[j] = price;
@@ -611,14 +595,18 @@ static void solve_all(budget *f)
 static void end_block(budget *f)
 {
     const int32_t J = f->s.J, B = f->posterior.B;
-    take_references(f);
+    take_references(f, f->R, f->lags, *f->s.setting[WINDOW], f->weight);
+    take_references(f, f->short_R, f->s.L, short_window(f), f->weight + 1);
     if (*f->controlled) {
         memmove(f->book + J, f->book, sizeof(real) * times(f->T - 1, J));
         for (int32_t j = 0; j < J; j++)
             f->book[j] = f->asked[J + j] / (real)B / f->s.setting[RATED_POWER][j];
     }
-    learn(&f->posterior, root(raised(*f->s.setting[WINDOW], B)));
-    if (*f->posterior.fits) solve_all(f);
+    learn(&f->posterior, *f->s.setting[MEMORY]);
+    if (f->posterior.counts[SILENT])
+        clear(f->s.weights, times(f->s.J * f->s.I, f->s.L));
+    else if (*f->posterior.fits && !f->posterior.counts[WAITING])
+        solve_all(f);
     *f->controlled = 0;
     clear(f->asked + J, (size_t)J);
     set_room(f);
@@ -658,6 +646,20 @@ static int note(budget *f, const real *error, int controlled)
     return ANC_DONE;
 }
 
+/* Cut clicks from the newest references. */
+static void cut_clicks(budget *f)
+{
+    for (int32_t i = 0; i < f->s.I; i++) {
+        real *x = newest(&f->s.x, i), size = *x < 0 ? -*x : *x;
+        const real most = GROWTH * f->peak[i];
+        if (most > 0 && size > most) {
+            size = most;
+            *x = *x < 0 ? -most : most;
+        }
+        f->peak[i] = larger(size, faded(f->peak[i], *f->s.setting[WINDOW], 0));
+    }
+}
+
 static int control_signal_budget(anc_view *view, const real *reference, real *control)
 {
     budget *f = (budget *)view;
@@ -667,6 +669,7 @@ static int control_signal_budget(anc_view *view, const real *reference, real *co
     const int refused = take_reference(s, reference);
     f->posterior.heard[AWAITED] = !refused;
     if (refused) return refused;
+    cut_clicks(f);
     for (int32_t j = 0; j < s->J; j++) {
         const real left = larger(f->asked[2 * s->J + j] - f->asked[s->J + j], 0), most = root(left);
         const real y = filter_output(s, j);
@@ -683,6 +686,7 @@ static int update_budget(anc_view *view, const real *error)
 }
 static int listen_budget(anc_view *view, const real *error)
 {
+    cut_clicks((budget *)view);
     return note((budget *)view, error, 0);
 }
 

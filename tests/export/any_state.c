@@ -21,7 +21,8 @@ static int run(anc_state *s, double *y) /* what the last update returns */
     for (int n = 0; n < 50; n++) {
         double x[ANC_REFERENCES], e[ANC_MICROPHONES];
         for (int i = 0; i < ANC_REFERENCES; i++) x[i] = (n * 7 + i) % 5 - 2;
-        for (int k = 0; k < ANC_MICROPHONES; k++) e[k] = (n * 3 + k) % 7 - 3;
+        for (int k = 0; k < ANC_MICROPHONES; k++)
+            e[k] = ((n * 3 + k) % 7 - 3) / 100.0; /* loud ones silence KF-PB */
 #ifdef ARRAYS
         anc_control_signal(s, x, y);
         answer = anc_update(s, e);

@@ -59,17 +59,17 @@ def run(case: study.Rated, **settings: float) -> tuple[np.ndarray, np.ndarray]:
 @contextmanager
 def without(rule: str) -> Iterator[dict[str, float]]:
     """Switch a rule off; the settings of the controller that this takes."""
-    kept = {name: getattr(law, name) for name in ("ACCOUNT", "WINDOW", "WORTHWHILE")}
-    share, hold = law.PowerBudget.share, law.PowerBudget.HOLD
+    kept = {name: getattr(law, name) for name in ("CHEAPER", "WINDOW_S", "WINDOWS", "WORTHWHILE", "SHORTER")}
+    share = law.PowerBudget.share
     settings = {"spread": 0.0}
     if rule == "account":
-        law.ACCOUNT = 0.0
+        law.CHEAPER = 0.0
     elif rule == "floor":
         law.WORTHWHILE = 0.0
     elif rule == "the shorter window":
-        law.WINDOW = 1
-    elif rule == "hold":
-        law.PowerBudget.HOLD = 0.0
+        law.WINDOW_S, law.WINDOWS = 10.0, 1
+    elif rule == "the level":
+        law.SHORTER = 1
     elif rule == "what the account stands":
         law.PowerBudget.share = lambda *_: 1.0
     elif rule == "with the path verified":
@@ -77,7 +77,7 @@ def without(rule: str) -> Iterator[dict[str, float]]:
     try:
         yield settings
     finally:
-        law.PowerBudget.share, law.PowerBudget.HOLD = share, hold
+        law.PowerBudget.share = share
         for name, value in kept.items():
             setattr(law, name, value)
 
@@ -88,7 +88,7 @@ def main() -> None:
     cases = [study.make_rated(plants[path], made[noise][1](), study.SHARES[0]) for path, noise in CASES]
     rules = (
         "nothing",
-        "hold",
+        "the level",
         "account",
         "floor",
         "the shorter window",

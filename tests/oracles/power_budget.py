@@ -13,32 +13,30 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from oracles.signals import Controller
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_toeplitz, solve_triangular, toeplitz
 
-UNKNOWN = 4.0  # after an alarm: root mean square of the error of a secondary path, over the path
-KEPT = 4.0  # after an alarm: what is known of the primary paths counts as so many samples for each tap
-FORGOTTEN = 1 / 16  # ... if they have changed
-JUDGED, WRONG = (9, 16), 4  # blocks after an alarm, and how many of them show that the primary paths have changed
+SURPRISE = 6.0  # error over the noise and the doubt that shows another plant
+REDRAWN = math.sqrt(2.0)  # rms error over the path, of a path that gave way to an independent one of the same size
+PARTS = 8  # of a block, in which a surprise is located
+NEWS = 1 / 8  # a fit begins if this share of the samples, or of the energy of x or y, is new
+FOREIGN = 16.0  # a noise so far beyond the disturbance that x foretells, which is so far below the usual one, has no part of x
+FADES = 0.5  # what a block leaves to the next of a sound that is longer than the paths
 DRAWS = 8  # of the posterior, that stand for its covariance
-SURPRISE, MISFIT, USUAL = (
-    4.0,
-    0.03,
-    5.0,
-)  # alarm: times the noise and the doubt; least share of the disturbance; times the usual misfit
-ACCOUNT = 4.0  # the price falls to (1 - 4/16)^16 = 0.01 of itself if nothing of the account is spent
+MEMORY_S = 5.0  # time constant of forgetting
+WORK = 2.0**26  # operations of a factorisation in a block
+GROWTH = 10.0  # a sound does not grow by more from one sample to the next, but a click does
+CHEAPER, CHEAPEST = 4.0, 0.7  # what is left of the account makes power cheaper by so many times its share; the least
 WORTHWHILE = 0.5  # a rating of power must save at least this share of the measurement noise
 MOST = 1.04  # of the account, that is never exceeded: what goes beyond it is clipped
-WINDOW = 8  # the filter is solved for the references of an exponential window of the averaging time over this
-TWICE = 2.0  # what lasted t may go on for twice as long
-SHORTEST = 20  # ... and for a twentieth of the averaging time
-SCALES = (100, 40, 4)  # t: windows of the averaging time over these; besides, the last block and the window above
-QUIET = 31  # blocks from the first fit after an alarm to the next alarm, at least
-KNOWN = 0.05  # no alarm before as much of the memory was heard
-WORK = 2.0**26  # operations of a factorisation in a block
+WINDOWS, WINDOW_S = 8, 1.25  # windows of x in the averaging time, and a window's longest time constant
+SHORTER = 5  # a window for the level of x than that for its spectrum
+WINDOW_LASTS, BLOCK_LASTS = (
+    4,
+    20,
+)  # parts of the averaging time for which the powers of the last window and block may go on
 
 
 def lagged(u, e, n):
@@ -72,30 +70,25 @@ class Plant:
         (K, J, M), I, N = s.shape, n_references, n_primary  # noqa: E741
         self.widths = [N] * I + [M] * (0 if self.exact else J)
         self.at = np.concatenate([[0], np.cumsum(self.widths)])
-        n = self.n = self.at[-1]
+        self.n = self.at[-1]
         self.primary = slice(0, I * N)
-        # The data: G = sum z z', r = sum e z, sum e^2, and how many samples, all fading by `forget` a block.
-        self.G, self.r, self.ee, self.count = np.zeros((n, n)), np.zeros((K, n)), np.zeros(K), 0.0
         self.size = np.mean(np.sum(s**2, axis=2))  # of a secondary path
         self.spread = spread
-        self.prior_p = None  # precision of a tap of p
-        self.theta, self.q = np.zeros((K, n)), np.zeros(K)
+        self.theta, self.q = np.zeros((K, self.n)), np.zeros(K)
         self.theta[:, I * N :] = 0.0 if self.exact else s.reshape(K, -1)
-        self.draws = np.zeros((DRAWS, n))  # of theta less its mean, for the mean noise; none yet
-        self.random = 1
-        self.delay = int(n**3 / 3 / WORK)  # blocks that a factorisation takes
-        self.collected = self.delay // 2 + 1  # blocks of data for the first fit after an alarm
-        self.first_fit = self.collected + self.delay  # blocks from an alarm to its end
-        self.pending, self.fitted, self.fits = None, 0.0, 0
-        self.age = self.idle = 0  # blocks since the loudspeakers sound or an alarm; since the last fit began
-        self.alarms = 0
-        self.sounds = self.doubtful = False  # doubtful: no fit since the alarm
-        self.misfit, self.seen = 0.0, 0.0  # mean of (res / d^2)^2, and its weight
-        self.limit, self.before, self.wrong = (
-            0.0,
-            0.0,
-            0,
-        )  # of the last alarm: what was exceeded, noise; blocks since that do
+        self.draws = np.zeros((DRAWS, self.n))  # of theta less its mean, for the mean noise; none yet
+        self.significant, self.random = 1.0, 1
+        self.delay = int(self.n**3 / 3 / WORK)  # blocks that a factorisation takes
+        self.waiting = self.silent = False  # waiting: no fit since a surprise
+        self.fits = self.surprises = 0
+        self.missed = self.expected = self.loud = 0.0
+        self.forget_all()
+
+    def forget_all(self):
+        """Begin the data: G = sum z z', r = sum e z, sum e^2, and how many samples, all fading by `forget` a block."""
+        K, n = self.theta.shape
+        self.G, self.r, self.ee, self.count = np.zeros((n, n)), np.zeros((K, n)), np.zeros(K), 0.0
+        self.fitted, self.pending = np.zeros(3), None
 
     @property
     def p(self):
@@ -114,111 +107,97 @@ class Plant:
         z = sum((filtered(h, u, self.B) for h, u in zip(s, y, strict=not self.exact)), np.zeros(self.B))
         return d, z
 
-    def learn(self, x, y, e, known):
-        """Take a block of errors e, (K, B); return whether the posterior no longer explains them."""
+    def explained(self):
+        """Return sum d^2 of the data, over all microphones."""
+        p = self.theta[:, self.primary]
+        return np.sum(p @ self.G[self.primary, self.primary] * p)
+
+    def held(self):
+        """Return the samples of the data, and their energies of x and of y."""
+        energy = np.diag(self.G)[self.at[:-1]]
+        n = self.primary.stop // self.widths[0]
+        return np.array([self.count, np.sum(energy[:n]), np.sum(energy[n:])])
+
+    def learn(self, x, y, e):
+        """Take a block of errors e, (K, B)."""
+        heard = np.mean(e**2)
         if self.exact:  # s^ is right: what it plays is no news
             e = e + np.array([sum(filtered(h, u, self.B) for h, u in zip(s, y, strict=True)) for s in self.s_hat])
-        explained = [self.explain(theta, x, y) for theta in self.theta]
-        d, z = (np.array(each) for each in zip(*explained, strict=True))
-        unexplained, d2 = np.mean((e - d + z) ** 2), np.mean(d**2)
-        q, loud = np.mean(self.q), bool(np.any(y[:, -self.B - self.s.shape[2] + 1 :]))
-        self.age += 1
-        self.idle += 1
-        if loud and not self.sounds:
-            self.sounds, self.age = True, 1
-        alarm = self.is_alarm(unexplained, d2, q, x, y) if known and loud else False
-        if alarm:
-            self.alarms += 1
-            self.begin_anew(FORGOTTEN if self.exact else KEPT)
-        elif self.is_wrong(unexplained):
-            self.begin_anew(FORGOTTEN)
-            self.q[:], self.limit = self.before, 0.0  # once for an alarm
-        elif known and self.fits and d2 > 0 and not self.doubtful:
-            self.misfit = self.forget**2 * self.misfit + min(unexplained / d2, 1.0) ** 2
-            self.seen = self.forget**2 * self.seen + 1.0
-        if not alarm:  # the block of a change is of two plants
-            self.add(x, y, e)
-        due = self.pending is None and (not self.doubtful or self.age >= self.collected)
-        news = self.count - self.fitted > self.count / 8 or (self.sounds and self.age <= 16)
-        if due and (news or (unexplained > 2 * q and self.idle >= 8)):
+        d, z = (np.array(each) for each in zip(*(self.explain(theta, x, y) for theta in self.theta), strict=True))
+        missed, d2, new = np.mean((e - d + z) ** 2, axis=0), np.mean(d**2, axis=0), self.B
+        loud = np.any(y[:, -self.B - self.s.shape[2] + 1 :])
+        if self.fits and not self.waiting and (self.exact or not loud or self.fitted[2] > 0):
+            usual = self.explained() / (self.count * len(e))
+            self.loud = max(np.mean(d2), FADES * self.loud)
+            usual_noise = self.missed / max(self.expected, 1e-300) * self.loud
+            limit = self.limit(max(np.mean(self.q), usual_noise), x, y)
+            ends = self.B * np.arange(1, PARTS + 1) // PARTS
+            of_part, d2_last = [np.mean(part) for part in np.split(missed, ends[:-1])], np.mean(d2[ends[-2] :])
+            if np.mean(missed) > limit:
+                foreign = of_part[-1] > FOREIGN * d2_last and FOREIGN * d2_last < usual
+                if foreign or of_part[-1] <= limit:
+                    new = 0  # none of x, or over already: it tells nothing of the plant
+                else:  # the plant is another one: begin again, with what was heard after the change
+                    new = self.B - ends[np.argmax(np.array(of_part) > limit)]
+                    self.forget_all()
+                    self.spread, self.waiting, self.surprises = REDRAWN, True, self.surprises + 1
+                    self.silent = heard >= np.mean(d2)  # the control does no good: listen to p alone
+            if new:
+                self.missed = self.forget * self.missed + min(np.mean(missed), np.mean(d2))
+                self.expected = self.forget * self.expected + np.mean(d2)
+        self.add(x, y, e, new)
+        due = self.waiting or np.any(self.held() * (1 - NEWS) > self.fitted)
+        if self.pending is None and new == self.B and due:
             self.begin_fit()
         if self.pending is not None:
             self.pending[0] -= 1
             if self.pending[0] < 0:
                 self.end_fit()
-        return alarm
 
-    def is_alarm(self, unexplained, d2, q, x, y):
-        """Return whether the error is beyond its noise, the usual misfit of the model, and what is not known."""
-        if self.age <= (QUIET + self.first_fit if self.alarms else 1) or self.doubtful or not self.seen:
-            return False
-        usual = max(MISFIT, USUAL * math.sqrt(self.misfit / self.seen))
-        limit = SURPRISE * q + usual * d2
-        if unexplained <= limit:
-            return False
+    def limit(self, noise, x, y):
+        """Return the largest mean square that the noise and the doubt explain; the noise grows with the disturbance."""
         draws = [] if self.exact else self.draws
         doubt = sum(np.mean(np.subtract(*self.explain(draw, x, y)) ** 2) for draw in draws) / DRAWS
-        if unexplained <= limit + SURPRISE * doubt:
-            return False
-        self.limit, self.before, self.wrong = limit, q, 0
-        return True
+        return SURPRISE * (noise + doubt)
 
-    def is_wrong(self, unexplained):
-        """Return whether other secondary paths do not explain the errors after an alarm: the primary ones have changed."""
-        fitted_for = self.age - self.first_fit
-        if self.exact or not self.limit or not JUDGED[0] <= fitted_for <= JUDGED[1]:
-            return False
-        self.wrong += unexplained > self.limit
-        return fitted_for == JUDGED[1] and self.wrong >= WRONG
-
-    def begin_anew(self, kept):
-        """The secondary paths have changed: they return to their prior; of the primary paths, some samples a tap are kept."""
-        p, n = self.primary, self.primary.stop
-        self.r[:, p] -= self.theta[:, n:] @ self.G[n:, p]  # as if s had been known until now
-        self.r[:, n:] = self.G[n:] = self.G[:, n:] = 0.0
-        kept = min(kept * self.n / self.count, 1.0)
-        self.G, self.r, self.count = kept * self.G, kept * self.r, kept * self.count
-        theta = self.theta[:, p]
-        self.ee = self.count * self.q + 2 * np.sum(theta * self.r[:, p], axis=1)
-        self.ee -= np.sum(theta @ self.G[p, p] * theta, axis=1)
-        self.pending, self.fitted, self.age, self.idle, self.doubtful = None, 0.0, 0, 0, True
-        if not self.exact:
-            self.spread, self.s, self.draws[:] = UNKNOWN, self.s_hat.copy(), 0.0
-            self.theta[:, n:] = self.s.reshape(len(theta), -1)
-
-    def add(self, x, y, e):
-        """Add the block to the data."""
-        f, B = self.forget, self.B
+    def add(self, x, y, e, new):
+        """Add the last `new` samples of the block to the data."""
+        f = self.forget
         self.G, self.r, self.fitted = f * self.G, f * self.r, f * self.fitted
-        self.ee, self.count = f * self.ee + np.sum(e**2, axis=1), f * self.count + B
-        z = [*x, *(() if self.exact else -y)]
-        for i, (u, a, n) in enumerate(zip(z, self.at[:-1], self.widths, strict=True)):
+        self.ee, self.count = f * self.ee, f * self.count
+        if new == 0:
+            return
+        e = e[:, -new:]
+        self.ee, self.count = self.ee + np.sum(e**2, axis=1), self.count + new
+        z = list(zip([*x, *(() if self.exact else -y)], self.at[:-1], self.widths, strict=True))
+        for i, (u, a, n) in enumerate(z):
             for k in range(len(e)):
                 self.r[k, a : a + n] += lagged(u, e[k], n)
-            for v, b, m in list(zip(z, self.at[:-1], self.widths, strict=True))[i:]:
-                new = gram(u, v, B, n, m)
-                self.G[a : a + n, b : b + m] += new
+            for v, b, m in z[i:]:
+                more = gram(u, v, new, n, m)
+                self.G[a : a + n, b : b + m] += more
                 if b > a:
-                    self.G[b : b + m, a : a + n] += new.T
+                    self.G[b : b + m, a : a + n] += more.T
 
     def begin_fit(self):
         """Set aside the data of now for a factorisation."""
         n = self.primary.stop
-        if self.prior_p is None:
-            x2 = np.mean(np.diag(self.G)[:n])
-            if not (x2 > 0 and np.all(self.ee > 0)):
-                return
-            # |p|^2 is expected to be E[d^2] / E[x^2]
-            self.prior_p, self.q = n * x2 / np.mean(self.ee), 1e-3 * self.ee / self.count
-        self.pending = [self.delay, self.G.copy(), self.r.copy(), self.ee.copy(), self.count]
-        self.fitted, self.idle = self.count, 0
+        x2 = np.mean(np.diag(self.G)[:n])
+        if not (x2 > 0 and np.all(self.ee > 0)):
+            return
+        if not np.any(self.q):
+            self.q = 1e-3 * self.ee / self.count
+        # |p|^2 is expected to be E[d^2 + e^2] / E[x^2] of the data of now
+        prior = n * x2 * len(self.ee) / (np.sum(self.ee) + self.explained())
+        self.pending = [self.delay, self.G.copy(), self.r.copy(), self.ee.copy(), self.count, prior]
+        self.fitted = self.held()
 
     def end_fit(self):
         """Solve for the posterior of the data set aside."""
-        _, G, r, ee, count = self.pending
+        _, G, r, ee, count, prior = self.pending
         self.pending = None
-        n, q, K = self.primary.stop, np.mean(self.q), len(r)
-        precision = np.full(self.n, self.prior_p)
+        p, n, q, K = self.primary, self.primary.stop, np.mean(self.q), len(r)
+        precision = np.full(self.n, prior)
         precision[n:] = self.s.shape[2] / (self.spread**2 * self.size) if not self.exact else 0.0
         C = cholesky(G + q * np.diag(precision), lower=True, check_finite=False)
         mean = np.zeros((K, self.n))
@@ -227,12 +206,15 @@ class Plant:
         residual = ee - 2 * np.sum(theta * r, axis=1) + np.sum(theta @ G * theta, axis=1)
         # The noise, with the earlier estimate counting as n samples: a short record leaves little noise by chance.
         self.q = np.maximum((residual + self.n * self.q) / (max(count - n / 2, 0.0) + self.n), 1e-6 * ee / count)
+        # By chance alone, n taps explain n q. James and Stein: what is not significant is not played.
+        self.significant = max(0.0, 1.0 - 2 * n * np.sum(self.q) / max(self.explained(), 1e-300))
+        theta[:, p] *= self.significant
         # Draws: theta has the covariance q (G + q prior)^-1 = q C'^-1 C^-1.
         signs = np.reshape([self.sign() for _ in range(DRAWS * self.n)], (DRAWS, self.n))
         self.draws = math.sqrt(q) * solve_triangular(C, signs.T, lower=True, trans=1, check_finite=False).T
         if not self.exact:
             self.s = theta[:, n:].reshape(self.s.shape)
-        self.fits, self.doubtful = self.fits + 1, False
+        self.fits, self.waiting, self.silent = self.fits + 1, False, False
 
     def sign(self):
         """Return a random sign."""
@@ -246,26 +228,22 @@ class Plant:
         """
         (K, J, M), (I, N) = self.s.shape, (self.p.shape[1], self.p.shape[2])  # noqa: E741
         ss, ps = np.zeros((J, J, 2 * M - 1)), np.zeros((I, J, N + M - 1))
-        samples = [(1.0, self.p[k], self.s[k]) for k in range(K)]
+        samples = [(1.0, 1.0, self.p[k], self.s[k]) for k in range(K)]
         if not self.exact:
             share = K / DRAWS  # draws are of the mean noise
-            samples += [(share, *self.parts(draw)) for draw in self.draws]
-        for weight, p, s in samples:
+            samples += [(share, share * self.significant, *self.parts(draw)) for draw in self.draws]
+        for weight, of_p, p, s in samples:
             for j in range(J):
                 for a in range(J):
                     ss[j, a] += weight * np.correlate(s[j], s[a], "full")
                 for i in range(I):
-                    ps[i, j] += weight * np.correlate(p[i], s[j], "full")
-        if not self.exact and self.doubtful:  # not yet verified: anything may be wrong, even the polarity
-            ss[range(J), range(J), M - 1] += K * UNKNOWN**2 * self.size
+                    ps[i, j] += of_p * np.correlate(p[i], s[j], "full")
         return ss, ps
 
 
 @dataclass(kw_only=True)
 class PowerBudget(Controller):
     """KF-PB; `w` is the control filter."""
-
-    HOLD: ClassVar[float] = 1.0  # 0: the price that is held falls at once
 
     rated_power: np.ndarray  # (J,)
     fs: float = 16000.0
@@ -278,22 +256,34 @@ class PowerBudget(Controller):
         (_, J, M), (_, I, L) = self.s_hat.shape, self.w.shape  # noqa: E741
         N, B = L + M - 1, max(round(self.block_s * self.fs), 1)
         self.B, self.N, self.lags = B, N, L + N
-        self.g = math.exp(-1 / (self.averaging_s * self.fs))  # of the window of the references, a sample
-        self.plant = Plant(self.s_hat, I, N, B, self.spread, self.g ** (B / 2))  # which remembers twice as long
-        self.blocks = max(round(self.averaging_s * self.fs / B), SHORTEST)  # over which the power is averaged
+        self.g = math.exp(-1 / (min(self.averaging_s / WINDOWS, WINDOW_S) * self.fs))  # of the window of x, a sample
+        self.plant = Plant(self.s_hat, I, N, B, self.spread, math.exp(-B / (MEMORY_S * self.fs)))
+        self.blocks = max(round(self.averaging_s * self.fs / B), BLOCK_LASTS)  # over which the power is averaged
         history = self.lags + B
         self.x_past, self.y_past = np.zeros((I, history)), np.zeros((J, history))
         self.new = []  # samples of this block: x, y, e, asked^2, or None while silent
+        self.peak = np.zeros(I)  # largest magnitude of x of late
         self.heard = 0  # samples that the delay lines hold
         self.R = np.zeros((I, I, self.lags))  # windowed sums of x_i(t) x_i'(t - l)
-        self.short = np.zeros((len(SCALES), I, I, L))
-        self.weights = np.zeros(1 + len(SCALES))
+        self.short = np.zeros((I, I, L))
+        self.weights = np.zeros(2)
         self.book = np.ones(
             (self.blocks, J)
         )  # power of each block over the rating, newest first; spent before the start
         self.set_room()
-        self.price, self.steady_price, self.held_price = np.zeros(J), np.zeros(J), np.zeros(J)
-        self.alarms = 0
+        self.price, self.steady_price = np.zeros(J), np.zeros(J)
+
+    @property
+    def alarms(self):
+        """Return the number of surprises."""
+        return self.plant.surprises
+
+    def hear(self, x):
+        """Take the newest references, without clicks."""
+        most = np.where(self.peak > 0, GROWTH * self.peak, np.inf)
+        x = np.clip(x, -most, most)
+        self.peak = np.maximum(np.abs(x), self.g * self.peak)
+        super().hear(x)
 
     def output(self):
         """Return y_j = sum_i v_ji * x_i, and note what is asked."""
@@ -335,11 +325,11 @@ class PowerBudget(Controller):
             self.book = np.concatenate([[asked / self.rated_power], self.book[:-1]])
         self.set_room()
         if e is not None and self.heard >= self.N:
-            self.alarms += self.plant.learn(
-                self.x_past, self.y_past, e, self.heard / B * (1 - self.plant.forget) >= KNOWN
-            )
+            self.plant.learn(self.x_past, self.y_past, e)
         self.heard += B
-        if self.plant.fits:
+        if self.plant.silent:
+            self.w[:] = 0.0
+        elif self.plant.fits and not self.plant.waiting:
             self.solve()
 
     def set_room(self):
@@ -349,23 +339,18 @@ class PowerBudget(Controller):
 
     def take_references(self):
         """Add the block to the windows of the references; x is zero before the first, so they are positive definite."""
-        B, n = self.B, self.lags
-        short = [(c, R, self.w.shape[2]) for c, R in zip(SCALES, self.short, strict=True)]
-        for scale, R, lags in [(WINDOW, self.R, n), *short]:
-            g = self.g**scale
-            window = g ** np.arange(B - 1, -1, -1.0)
-            R *= g**B
+        for c, (R, g) in enumerate([(self.R, self.g), (self.short, self.g**SHORTER)]):
+            window = g ** np.arange(self.B - 1, -1, -1.0)
+            R *= g**self.B
             for i, u in enumerate(self.x_past):
                 for a, v in enumerate(self.x_past):
-                    R[i, a] += lagged(v, window * u[-B:], lags)
-        for c, scale in enumerate((WINDOW, *SCALES)):
-            g = self.g**scale
-            self.weights[c] = g**B * self.weights[c] + np.sum(g ** np.arange(B))
+                    R[i, a] += lagged(v, window * u[-self.B :], R.shape[2])
+            self.weights[c] = g**self.B * self.weights[c] + np.sum(window)
 
     def solve(self):
         """Give each loudspeaker in turn the filter of least expected error at its price, given the others'."""
         (J, I, L), M, N = self.w.shape, self.s_hat.shape[2], self.N  # noqa: E741
-        R = self.R / self.weights[0] * self.g ** (WINDOW / 2 * np.arange(self.lags))
+        R = self.R / self.weights[0] * self.g ** (np.arange(self.lags) / 2)
         R = np.concatenate([np.swapaxes(R, 0, 1)[..., :0:-1], R], axis=2)  # C_xx(l), l from 1 - lags on
         ss, ps = self.plant.correlations()
         middle = self.lags - 1
@@ -391,37 +376,36 @@ class PowerBudget(Controller):
         L, rho = self.w.shape[2], self.rated_power[j]
         middle = self.lags - 1
         system = System(A, R[:, :, middle - L + 1 : middle + L], b)
-        # 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly only.
-        self.steady_price[j], _, _ = system.price_of(rho, self.steady_price[j])
-        self.held_price[j] = max(self.steady_price[j], self.HOLD * self.held_price[j] * self.plant.forget)
-        # 3 What the account holds makes power cheaper, but none that saves little of the noise.
+        # 1 The price at which the filter spends the rating, for the spectrum of the window of x and the level of the
+        # shorter one, which the last filter tells.
+        usual, now = np.sum(self.w[j] * product(system.R, self.w[j])), self.power_of_now(self.w[j])
+        level = now / usual if usual > 0 and now > 0 else 1.0
+        self.steady_price[j], _, _ = system.price_of(rho / level, self.steady_price[j])
+        # 2 What the account holds makes power cheaper, but none that saves little of the noise.
         price = max(
-            self.held_price[j] * (1.0 - ACCOUNT / 16 * max(left, 0.0)) ** 16,
+            self.steady_price[j] * max(1.0 - CHEAPER * max(left, 0.0), CHEAPEST),
             WORTHWHILE * np.sum(self.plant.q) / (rho * len(self.rated_power)),
         )
         v, power = system.at(price)
-        # 4 The account must stand it if the last t goes on for twice as long, for every t.
+        # 3 The account must stand it if the last t goes on for twice as long, for every t.
         share = self.share(j, v, power) if power > 0 else 1.0
         if share < 1.0:
             price, v, _ = system.price_of(share * power, price)
         self.price[j], self.w[j] = price, v
 
+    def power_of_now(self, v):
+        """Return the mean power of a filter v, (I, L), over the short window."""
+        I, L = v.shape  # noqa: E741
+        C = self.short / self.weights[1] * self.g ** (SHORTER / 2 * np.arange(L))
+        # E[y^2] = sum_l (v_i ~ v_a)(l) C_ia(l), with both signs of l in the two orders of i and a
+        h = [[np.correlate(v[a], v[i], "full")[L - 1 :] for a in range(I)] for i in range(I)]  # sum_m v_a(m + l) v_i(m)
+        return sum(2 * h[i][a] @ C[i, a] - h[i][a][0] * C[i, a, 0] for i in range(I) for a in range(I))
+
     def share(self, j, v, power):
-        """Return the largest share of its power that the account of loudspeaker j stands, for a filter v, (I, L), and its power."""
-        spent = np.concatenate([[0.0], np.cumsum(self.book[:, j])])
-        T, L = self.blocks, v.shape[1]
+        """Return the largest share of its power that the account of loudspeaker j stands, for a filter v, (I, L)."""
+        spent, T = np.concatenate([[0.0], np.cumsum(self.book[:, j])]), self.blocks
         y = sum(filtered(h, u, self.B) for h, u in zip(v, self.x_past, strict=True))
-        expected = [(np.mean(y**2), T // SHORTEST), (power, round(TWICE * T / WINDOW))]  # power, for how many blocks
-        taper = self.g ** (np.arange(L) / 2)
-        for scale, R, weight in zip(SCALES, self.short, self.weights[1:], strict=True):
-            power = 0.0
-            for i in range(len(v)):
-                for a in range(len(v)):
-                    # E[y^2] = sum_l (v_i ~ v_a)(l) C_ia(l), with both signs of l in the two orders of i and a
-                    C = taper**scale * R[i, a] / weight
-                    h = np.correlate(v[a], v[i], "full")[L - 1 :]  # sum_m v_a(m + l) v_i(m)
-                    power += h @ C + h[1:] @ C[1:] if i == a else 2 * (h[1:] @ C[1:]) + h[0] * C[0]
-            expected.append((power, max(round(TWICE * T / scale), T // SHORTEST)))
+        expected = [(power, T // WINDOW_LASTS), (np.mean(y**2), T // BLOCK_LASTS)]  # power, for how many blocks
         rho = self.rated_power[j]
         return min(max(T - spent[T - n], 0.02 * n) / n * rho / max(power, 1e-300) for power, n in expected)
 
