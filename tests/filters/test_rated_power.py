@@ -83,7 +83,7 @@ def test_a_factor_without_a_rated_power_scales_the_measurement(kind: str) -> Non
     for factor, y in ((0.5, 1.0), (0.0, 0.0), (None, 2.0)):
         kf.constraint_factor, kf.x = factor, np.zeros((TAPS, 1))
         kf.update(2.0, H=np.ones((1, TAPS)))
-        assert (kf.y.item(), kf.z.item()) == (y, 2.0)
+        assert (kf.y.item(), np.asarray(kf.z).item()) == (y, 2.0)
 
 
 # What a rated power is not for.
