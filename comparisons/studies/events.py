@@ -12,9 +12,10 @@ import numpy as np
 from kfopc_filterpy import Plant, kf_pb, power_constrained_wiener
 from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.metrics import overshoot
-from kfopc_filterpy.signals import band_limited_noise, level_jump
+from kfopc_filterpy.signals import band_limited_noise
 
 from ..bench import Claim, Parameter, Runs, StudyReport, Table
+from ..bench.noises import level_jump
 from ..bench.scene import reachable_weights
 from .report_parts import report_of_rows
 
