@@ -56,8 +56,13 @@ def test_the_filter_has_a_constraint_of_its_own_whose_settings_stay() -> None:
     assert (kf.constraint.memory_s, kf.secondary_path_gain) == (0.1, 1.0)
     kf = KFOPC(2 * TAPS, constraint=given)
     kf.rated_power = [1.0, 2.0]
+    kf.rated_power = None
+    kf.rated_power = [1.0, 2.0]
     assert kf.rated_power.tolist() == [1.0, 2.0]
     assert [one.memory_s for one in kf.constraint] == [0.1, 0.1]
+    kf.update(3.0, H=np.ones(2 * TAPS))
+    kf.rated_power = [3.0, 4.0]
+    assert kf.disturbance_power.tolist() == [9.0, 9.0]  # the powers stay
     for bad in ([], [1.0, "loud"]):
         with pytest.raises(TypeError):
             KFOPC(4, rated_power=bad, fs=FS)

@@ -372,6 +372,16 @@ def test_what_is_wrong_beside_a_gap_is_refused() -> None:
     assert kf.x is x
 
 
+@pytest.mark.skipif(not hasattr(KalmanFilter, "update_sequential"), reason="filterpy 1.4.5 has no update_sequential")
+def test_update_sequential_writes_into_no_array_that_is_held() -> None:
+    """As filterpy does; then a step could not be undone."""
+    kf = make("general")
+    held = [getattr(kf, name) for name in ("x", "y", "K", "z")]
+    before = copy.deepcopy(held)
+    kf.update_sequential(0, 1.0)
+    np.testing.assert_equal(held, before)
+
+
 @pytest.mark.skipif(hasattr(KalmanFilter, "update_sequential"), reason="filterpy 2.0.0 has update_sequential")
 def test_update_sequential_needs_filterpy_2() -> None:
     with pytest.raises(AttributeError, match=r"2\.0\.0"):
