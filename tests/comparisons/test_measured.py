@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -126,6 +127,15 @@ def test_without_a_folder_each_file_is_fetched_once_to_the_cache(source: Source,
         assert path.startswith(f"/{repository}/")
         assert " " not in path
     assert left_in(tmp_path / "cache" / "kfopc_filterpy") == ["Motor.mat", "Path.mat", "Pz1.mat", "Sz.mat"]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_sees_a_bar_of_the_download(
+    source: Source, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], terminal: bool
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    fetch("duct/Pz1.mat")
+    assert ("100%" in capsys.readouterr().err) == terminal
 
 
 def test_first_index_of_the_room_is_the_microphone_and_second_the_loudspeaker(source: Source) -> None:
