@@ -41,8 +41,6 @@ def run_or_undo(kf: KalmanFilter, step: Callable[..., None], arguments: tuple[An
     try:
         step(*arguments)
         if not _is_plainly_sound(kf):
-            if checks is not None:
-                checks(kf, *arguments)
             _require_sound(kf)
     except BaseException as error:
         kf.__dict__.clear()

@@ -250,8 +250,10 @@ class KFOPC(KalmanFilter, Checkpointed):
         Q: ArrayLike | None = None,
     ) -> None:
         """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
-        if isinstance(u, np.ma.MaskedArray) or not checked_steps.is_usual_prediction(self, F, Q):
+        if not checked_steps.is_usual_prediction(self, F, Q):
             u, B, F, Q = checked_steps.checked_prediction(self, u, B, F, Q)
+        elif u is not None:
+            checked_steps.require_control(self, u, B)
         if self._constraint is not None:
             self._require_random_walk(self.F if F is None else F)
         self._all_or_nothing(super().predict, checked_steps.checked_prediction, u, B, F, Q)

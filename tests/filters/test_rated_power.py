@@ -49,8 +49,9 @@ def test_a_rated_power_comes_with_a_rate_or_a_constraint(kind: str) -> None:
 def test_the_filter_has_a_constraint_of_its_own_whose_settings_stay() -> None:
     given = OutputPowerConstraint(1.0, fs=FS, memory_s=0.1, secondary_path_gain=1.0)
     kf = KFOPC(TAPS, constraint=given)
+    two = KFOPC(TAPS + 1, constraint=[given, given])
     given.rated_power = 99.0
-    assert kf.rated_power == 1.0
+    assert (kf.rated_power, *two.rated_power) == (1.0, 1.0, 1.0)
     kf.rated_power = None
     kf.rated_power = 2.0
     assert (kf.constraint.memory_s, kf.secondary_path_gain) == (0.1, 1.0)

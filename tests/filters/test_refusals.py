@@ -124,6 +124,7 @@ OTHER_STEPS = {
     "f.batch_filter([None] * 2, Qs=[1.5e308] * 2)": "step 1 of the batch: .*overflow",
     "f.predict(u=nan, B=ones((5, 1)))": "u must be finite",
     "f.predict(u=np.ma.masked_all((1, 1)), B=ones((5, 1)))": "u must be finite",
+    "f.predict(u=1.0, B=np.ma.masked_all((5, 1)))": "B must be finite",
     "f.predict(u=ones((1, 1)), B=ones((6, 1)))": r"predict: .*\(shapes: .*'B': \(6, 1\)",
     "f.predict(u=ones((1, 3)), B=ones((5, 1)))": "x would become",
     "f.predict_steadystate(u=nan, B=ones((5, 1)))": "u must be finite",
