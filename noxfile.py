@@ -268,11 +268,15 @@ def lower_bounds() -> list[str]:
 
 @nox.session(default=False)
 def mutants(session: nox.Session) -> None:
-    """Change a package at some random places, and print the changes that its tests miss: `-- power 40`.
+    """Change a package, or a C file of the core, at random places, and print what its tests miss: `-- power 40`, `-- lms.c`.
 
     The packages are the files in tests/mutants/, and so are the tests that must fail. Without a number, every mutant is run.
     """
     name, *number = session.posargs or ["power", "40"]
+    if name.endswith(".c"):
+        session.install(*PINNED, "-e", ".[test]")
+        session.run("python", "tests/mutants/core.py", name, *number)
+        return
     tree = copy_tree(session)
     session.install(*PINNED, "-e", f"{tree}[test]")
     install_group(session, "mutants")

@@ -62,7 +62,7 @@ static void start_lap(anc_limiter *c, rows r, int32_t N)
 static real square_of(const anc_limiter *c, real y) { return (y * c->scale) * (y * c->scale); }
 
 /* Take an input's energy, and set the gain. */
-static void set_gain(anc_limiter *c, rows r, int32_t i, int32_t N, real u)
+static void hear(anc_limiter *c, rows r, int32_t i, int32_t N, real u)
 {
     const real energy = square_of(c, smaller(c->planned, u < 0 ? -u : u));
     c->arrived += energy;
@@ -74,28 +74,47 @@ static void set_gain(anc_limiter *c, rows r, int32_t i, int32_t N, real u)
     c->gain = smaller(c->gain + rise, wanted);
 }
 
-real anc_limit(anc_limiter *c, real *laps, real u)
+/* Return the output: what is wanted, within the amplitude limit, and with no more than the energy
+ * that is left. This is the guarantee; the gain makes a clip rare. */
+static real fit(anc_limiter *c, real wanted, real u, real left)
 {
-    const int32_t N = (int32_t)c->size, i = (int32_t)c->position;
-    const rows r = {laps, laps + N + 1, laps + 2 * ((size_t)N + 1)};
-    if (!isfinite(u)) return (real)NAN;
-    set_gain(c, r, i, N, u);
-    const real wanted = c->gain * u;
-    const real left = c->budget - (c->spent + r.out[i + 1]);
     real y = smaller(c->limit, larger(-c->limit, wanted));
-    if (square_of(c, y) > left) { /* the guarantee; the gain makes this rare */
-        y = c->peak * root(larger(0, left));
-        if (u < 0) y = -y;
+    if (square_of(c, y) > left) {
+        const real rest = root(larger(0, left)), most = c->peak * rest;
+        y = u < 0 ? -most : most;
     }
     if (y != wanted) c->clipped += 1;
-    c->spent += square_of(c, y);
+    return y;
+}
+
+/* Take an output's energy, and go on to the next position. */
+static void take(anc_limiter *c, rows r, int32_t i, int32_t N, real square)
+{
+    c->spent += square;
     r.out[i] = -c->spent;
-    r.square[i] = square_of(c, y);
+    r.square[i] = square;
     if (i + 1 < N)
         c->position = (real)(i + 1);
     else
         start_lap(c, r, N);
+}
+
+/* Return the output at position i of a lap. */
+static real limited(anc_limiter *c, rows r, int32_t i, int32_t N, real u)
+{
+    hear(c, r, i, N, u);
+    const real wanted = c->gain * u;
+    const real left = c->budget - (c->spent + r.out[i + 1]);
+    const real y = fit(c, wanted, u, left);
+    take(c, r, i, N, square_of(c, y));
     return y;
+}
+
+real anc_limit(anc_limiter *c, real *laps, real u)
+{
+    const int32_t N = (int32_t)c->size;
+    const rows r = {laps, laps + N + 1, laps + 2 * ((size_t)N + 1)};
+    return isfinite(u) ? limited(c, r, (int32_t)c->position, N, u) : (real)NAN;
 }
 
 void anc_limit_all(anc_limiter *c, real *laps, const real *input, real *output, int64_t n)

@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -29,7 +30,7 @@ COMMON = ("controller.c", "signals.c", "constraint.c", "amplifier.c", "limiter.c
 
 def frama_c(folder: Path, *arguments: object) -> str:
     """Return what Frama-C prints."""
-    flags = f"-cpp-extra-args=-DLANES_OF_ONE -I{CORE} -I{HERE} -I{folder}"
+    flags = f"-cpp-extra-args=-DLANES_OF_ONE -I{folder} -I{CORE} -I{HERE}"
     return printed("frama-c", flags, *MACHINE, *arguments)
 
 
@@ -71,6 +72,95 @@ def lms(algorithm: str, settings: str, **shape: int) -> Callable[[], list[str]]:
     return lambda: controller(f"anc_{algorithm}", settings, "lms.c", **shape)
 
 
+def woven(contracts: Path, folder: Path, right: str = "", wrong: str = "") -> list[Path]:
+    """Write copies of the core's files with the blocks of a file of contracts in them, and return their paths.
+
+    A fault, `wrong` in place of what is `right`, can be put into the last one.
+    """
+    _, *parts = re.split(r"^== (.*)\n", contracts.read_text(), flags=re.M)
+    for name, blocks in zip(parts[::2], parts[1::2], strict=True):
+        lines = (CORE / name).read_text().splitlines()
+        for side, begin, block in re.findall(r"^([<>]) (.*)\n((?:(?![<>] ).*\n)+)", blocks, flags=re.M):
+            (at,) = [n for n, line in enumerate(lines) if line.strip().startswith(begin)]
+            lines[at + (side == ">") : at + (side == ">")] = block.rstrip().splitlines()
+        text = "\n".join(lines) + "\n"
+        if right and name == parts[-2]:
+            assert text.count(right) == 1, right
+            text = text.replace(right, wrong)
+        (folder / name).write_text(text)
+    for path in CORE.glob("*.h"):
+        if path.name not in parts:
+            (folder / path.name).write_text(path.read_text())
+    return [folder / name for name in parts[::2]]
+
+
+def goals(path: Path, folder: Path, *options: str, patience_s: int = 30) -> list[str]:
+    """Return the goals of a file's contracts, over real numbers, that WP leaves open."""
+    wp = ("-wp", "-wp-model", "Typed+real", "-wp-prover", "cvc4,z3", "-wp-timeout", patience_s, "-wp-par", 1)
+    text = frama_c(folder, *wp, *options, path)
+    proved = re.search(r"Proved goals: +(\d+) / (\d+)", text)
+    if proved and proved[1] == proved[2]:
+        return []
+    return re.findall(r"^\[wp\] \[(?:Failed|Timeout|Unknown)\] Goal .*", text, flags=re.M) or [text[-1500:]]
+
+
+def theorem() -> list[str]:
+    """Return the goals of the limiter's theorem that are open: no window exceeds its budget."""
+    with tempfile.TemporaryDirectory() as made:
+        path = woven(HERE / "limiter.acsl", Path(made))[-1]
+        # `root` is exact, by assumption; `anc_limit` only finds the rows, and the position as a whole number.
+        return goals(path, Path(made), "-wp-skip-fct", "root,anc_limit,anc_limit_all")
+
+
+FAULTS = {  # a function, what is right in it, and what is not
+    "no guarantee": ("fit", "if (square_of(c, y) > left) {", "if (0) {"),
+    "clipped to the other sign": ("fit", "y = u < 0 ? -most : most;", "y = u > 0 ? -most : most;"),
+    "no amplitude limit": ("fit", "smaller(c->limit, larger(-c->limit, wanted))", "wanted"),
+    "energy not noted": ("take", "c->spent += square;", ""),
+    "wrong sign of the lap": ("take", "r.out[i] = -c->spent;", "r.out[i] = c->spent;"),
+    "last lap not summed": ("start_lap", "r.out[k] = rest;", ""),
+}
+
+
+def faults() -> list[str]:
+    """Return the faults that the theorem does not notice: a proof that cannot fail proves nothing."""
+    unseen = []
+    for name, (function, right, wrong) in FAULTS.items():
+        with tempfile.TemporaryDirectory() as made:
+            path = woven(HERE / "limiter.acsl", Path(made), right, wrong)[-1]
+            if not goals(path, Path(made), "-wp-fct", function, patience_s=3):
+                unseen.append(name)
+    return unseen
+
+
+def rounding() -> list[str]:
+    """Return the open goals of the lemma on rounded sums, for any number of terms."""
+    with tempfile.TemporaryDirectory() as made:
+        return goals(HERE / "rounding.c", Path(made))
+
+
+def margin() -> list[str]:
+    """Return what is wrong with the margin for rounding: windows that could exceed the rated power."""
+    wrong = []
+    for form, bits, wide, longest in (("ieee_64", 53, 200, 10**7), ("ieee_32", 24, 30, 83_000)):
+        u = Fraction(1, 2**bits)
+        text = (HERE / "clip.gappa").read_text().replace("FORMAT", form).replace("WIDE", str(wide))
+        text = text.replace("ROUNDINGS", f"{3 * 2**10 + 1}b-{bits + 10}").replace("UNIT", f"1b-{bits}")
+        said = printed("gappa", given=text)
+        if "Results" in said or "Error" in said or "failed" in said:
+            wrong.append(f"{form}: {said}")
+        # peak * scale is at most 1 - 8 u, rounded twice; then the roundings that Gappa bounds, and that of the square.
+        clipped = ((1 - 8 * u) * (1 + u) ** 2 * (1 + 3 * u + u / 2**9)) ** 2 * (1 + u)
+        # A sum of N terms, 11 roundings of an energy and one of what is left, see `OutputLimiter`.
+        window = (1 - 2 * (longest + 16) * u) * (1 + u) / ((1 - (longest - 1) * u) * (1 - 12 * u))
+        wrong += [
+            f"{form}: {name} is 1 + {float(most - 1):.3g}"
+            for name, most in (("clipped", clipped), ("window", window))
+            if most >= 1
+        ]
+    return wrong
+
+
 JOBS: dict[str, Callable[[], list[str]]] = {
     "limiter, window 16, any input, for ever": lambda: alarms(
         "limiter_runs.c", ("limiter.c",), ("-eva-slevel", 40), r"show_each_y: \[-8\. \.\. 8\.\] . \{NaN\}"
@@ -91,12 +181,24 @@ JOBS: dict[str, Callable[[], list[str]]] = {
     "MOV-FxLMS": lms("mov", "0.01, 1"),
     "two-gradient FxLMS": lms("two_gradient", "0.01, 1, 0.1"),
     "re-scaling FxLMS": lms("rescaling", "0.01, 1"),
+    "limiter: no window exceeds its budget, over real numbers": theorem,
+    "faults of the limiter are noticed": faults,
+    "sums of any length, rounded": rounding,
+    "margin for rounding": margin,
     "diagonal KF": lambda: controller("anc_diagonal", "1e-9, 1e-3, 1", "diagonal.c", run=4),
 }
 
 
 def main() -> int:
     """Run the jobs whose names contain an argument, or all."""
+    with tempfile.TemporaryDirectory() as made:
+        os.environ["WHY3CONFIG"] = str(Path(made, "why3.conf"))  # the provers of this machine
+        printed("why3", "config", "detect")
+        return run()
+
+
+def run() -> int:
+    """Run the jobs, and print what is proved."""
     chosen = {name: job for name, job in JOBS.items() if any(part in name for part in sys.argv[1:] or [""])}
     with ThreadPoolExecutor(min(2, os.cpu_count() or 1)) as pool:
         running = {name: pool.submit(job) for name, job in chosen.items()}
