@@ -16,6 +16,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 BITS = "tests/core/test_same_bits.py::test_libraries_of_all_levels[baseline-double]"
@@ -35,7 +36,7 @@ TESTS = {
         BITS,
     ),
 }
-CHANGES = (  # what a line may have, and what it becomes
+CHANGES: tuple[tuple[str, Any], ...] = (  # what a line may have, and what it becomes
     *((rf" {re.escape(old)} ", f" {new} ") for old, new in ("+-", "-+", "*/", "/*", "<>", "><")),
     *((f" {old} ", f" {new} ") for old, new in ((r"\+=", "-="), ("<=", "<"), (">=", ">"), ("==", "!="), ("!=", "=="))),
     *((f" {old} ", f" {new} ") for old, new in ((r"&&", "||"), (r"\|\|", "&&"))),

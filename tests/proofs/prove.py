@@ -16,6 +16,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).resolve().parent
 CORE = HERE.parents[1] / "kfopc_filterpy" / "core"
@@ -47,7 +48,7 @@ def printed(*command: object, given: str | None = None) -> str:
 
 
 def alarms(
-    program: str, sources: tuple[str, ...], options: tuple[object, ...], says: str = "", **shape: object
+    program: str, sources: tuple[str, ...], options: tuple[object, ...], says: str = "", **shape: Any
 ) -> list[str]:
     """Return what Eva finds in a program of this folder with files of the core: alarms, or a line that is missing."""
     with tempfile.TemporaryDirectory() as made:
@@ -63,7 +64,13 @@ def controller(
     algorithm: str, settings: str, *sources: str, run: int = 8, window: int = 0, channels: int = 1
 ) -> list[str]:
     """Return what Eva finds in a run of a controller."""
-    shape = {"algorithm": algorithm, "settings": settings, "run": run, "window": window, "channels": channels}
+    shape: dict[str, Any] = {
+        "algorithm": algorithm,
+        "settings": settings,
+        "run": run,
+        "window": window,
+        "channels": channels,
+    }
     return alarms("controller_runs.c", (*COMMON, *sources), ("-eva-slevel", 0, *CONTROLLER), **shape)
 
 
