@@ -85,6 +85,12 @@ class OutputLimiter:
     and the right side from one more. The budget is :math:`1 - 2 (N + 16) \epsilon` instead of 1, a margin larger than
     all of these errors, so the exact sum stays below 1. Squares that underflow add less than :math:`2^{-1000}`.
 
+    ``nox -s prove``, in a clone, has this checked by machines. For every window length, input and setting in range,
+    Frama-C/WP proves that the limiter's algorithm, over real numbers, keeps the ring of the last N energies within its
+    budget; that the ring is the last N outputs follows by hand, because each call overwrites the oldest one. A second
+    machine-checked lemma and Gappa bound the rounding of IEEE arithmetic within the margin that the budget leaves, apart
+    from underflow. Eva shows for a window of 16 samples and any bit pattern as input that the C has no undefined behaviour.
+
     *Gain.* Let :math:`B_h` be the part of the budget that is not used by the outputs still in the window h samples from
     now, and :math:`P_h` the input energy until then. The largest gain that can be sustained is the minimum of
     :math:`\sqrt{B_h / P_h}` over h, at most 1. The prediction of :math:`P_h` is the worst of some 20 past windows, but
