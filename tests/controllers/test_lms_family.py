@@ -246,3 +246,28 @@ def test_a_matrix_of_systems_is_a_secondary_path() -> None:
     np.testing.assert_allclose(got.error, want.error, rtol=0, atol=1e-12)
     with pytest.raises(ValueError, match="fs is 500 Hz but the controller's secondary path is for 16000 Hz"):
         simulate(controller, noises(100), Plant(PATHS, PRIMARY, fs=500.0))
+
+
+def test_a_large_leak_forgets_everything_and_no_more() -> None:
+    """With mu gamma above 1, w = 0 w + mu e x', not a negative share of what was there."""
+    made = optimal_leaky_fx_lms(1, [1.0], step_size=0.5, rated_power=1e-6, fs=FS)
+    for reference, error in ((1.0, 4.0), (1.0, 5.0), (1.0, -6.0)):
+        made.control_signal(reference)
+        made.update(error)
+        if made.constraint_factor < 0.3:  # gamma = G E[x^2] (1 / alpha - 1) > 2
+            np.testing.assert_allclose(made.weights, [0.5 * error], rtol=1e-12)
+    assert made.constraint_factor < 0.3
+
+
+def test_weights_that_were_learned_of_hardly_anything_begin_anew() -> None:
+    """FxNLMS: at 100 times the amplitude of what they were learned of, and not at 50 times; nor with a regularization."""
+    some: dict[str, Any] = {"regularization": 1e-12}
+    for louder, options, forgets in ((101.0, {}, True), (50.0, {}, False), (101.0, some, False)):
+        made = fx_nlms(1, [1.0], step_size=0.1, **options)
+        for _ in range(10):
+            made.control_signal(1e-3)
+            made.update(1.0)
+        before = made.weights
+        assert before[0] > 1.0
+        made.control_signal(louder * 1e-3)
+        np.testing.assert_array_equal(made.weights, [0.0] if forgets else before)
