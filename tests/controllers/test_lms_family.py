@@ -271,3 +271,13 @@ def test_weights_that_were_learned_of_hardly_anything_begin_anew() -> None:
         assert before[0] > 1.0
         made.control_signal(louder * 1e-3)
         np.testing.assert_array_equal(made.weights, [0.0] if forgets else before)
+
+
+def test_a_leak_may_be_above_one() -> None:
+    """It is in the unit of the filtered reference's power: w = (1 - mu gamma) w + mu e x'."""
+    made, w = leaky_fx_lms(1, [1.0], step_size=0.05, leak=10.0), 0.0
+    for error in (4.0, 5.0, -6.0):
+        made.control_signal(1.0)
+        made.update(error)
+        w = 0.5 * w + 0.05 * error
+    np.testing.assert_allclose(made.weights, [w], rtol=1e-12)
