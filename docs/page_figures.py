@@ -124,7 +124,7 @@ def predictions(delays: Sequence[int] = range(9), duration_s: float = 10.0) -> R
             predictor_reference(half), plant, n_taps=8, rated_power=rated, disturbance=half
         )
         controllers = (
-            kf_pb(8, plant, rated_power=rated, averaging_s=1.0),
+            kf_pb(8, plant, rated_power=rated, averaging_s=4.0),
             kf_opc(8, plant, rated_power=rated, state_noise=1e-12, measurement_noise=0.3),
         )
         runs = simulate([with_internal_model(c) for c in controllers], None, plant, disturbance=d)

@@ -88,7 +88,7 @@ static real fit(anc_limiter *c, real wanted, real u, real left)
 }
 
 /* Take an output's energy, and go on to the next position. */
-static void take(anc_limiter *c, rows r, int32_t i, int32_t N, real square)
+static void record(anc_limiter *c, rows r, int32_t i, int32_t N, real square)
 {
     c->spent += square;
     r.out[i] = -c->spent;
@@ -100,13 +100,13 @@ static void take(anc_limiter *c, rows r, int32_t i, int32_t N, real square)
 }
 
 /* Return the output at position i of a lap. */
-static real limited(anc_limiter *c, rows r, int32_t i, int32_t N, real u)
+static real restrain(anc_limiter *c, rows r, int32_t i, int32_t N, real u)
 {
     hear(c, r, i, N, u);
     const real wanted = c->gain * u;
     const real left = c->budget - (c->spent + r.out[i + 1]);
     const real y = fit(c, wanted, u, left);
-    take(c, r, i, N, square_of(c, y));
+    record(c, r, i, N, square_of(c, y));
     return y;
 }
 
@@ -114,7 +114,7 @@ real anc_limit(anc_limiter *c, real *laps, real u)
 {
     const int32_t N = (int32_t)c->size;
     const rows r = {laps, laps + N + 1, laps + 2 * ((size_t)N + 1)};
-    return isfinite(u) ? limited(c, r, (int32_t)c->position, N, u) : (real)NAN;
+    return isfinite(u) ? restrain(c, r, (int32_t)c->position, N, u) : (real)NAN;
 }
 
 void anc_limit_all(anc_limiter *c, real *laps, const real *input, real *output, int64_t n)

@@ -119,13 +119,13 @@ def theorem() -> list[str]:
         return goals(path, Path(made), "-wp-fct", PROVED)
 
 
-PROVED = "larger,smaller,aim,start_lap,square_of,hear,shrunk,less,scaled,fit,take,limited"
+PROVED = "larger,smaller,aim,start_lap,square_of,hear,shrunk,less,scaled,fit,record,restrain"
 FAULTS = {  # a function, what is right in it, and what is not
     "no guarantee": ("fit", "if (square_of(c, y) > left) {", "if (0) {"),
     "clipped to the other sign": ("fit", "y = u < 0 ? -most : most;", "y = u > 0 ? -most : most;"),
     "no amplitude limit": ("fit", "smaller(c->limit, larger(-c->limit, wanted))", "wanted"),
-    "energy not noted": ("take", "c->spent += square;", ""),
-    "wrong sign of the lap": ("take", "r.out[i] = -c->spent;", "r.out[i] = c->spent;"),
+    "energy not noted": ("record", "c->spent += square;", ""),
+    "wrong sign of the lap": ("record", "r.out[i] = -c->spent;", "r.out[i] = c->spent;"),
     "last lap not summed": ("start_lap", "r.out[k] = rest;", ""),
 }
 
