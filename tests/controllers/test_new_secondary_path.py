@@ -51,7 +51,7 @@ def test_it_goes_on_as_if_it_had_always_had_the_new_path(name: str, guarded: boo
     emitted = drive(one, 100, 400)
     np.testing.assert_allclose(emitted, drive(other, 100, 400), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(one.weights, other.weights, rtol=1e-9, atol=1e-12)
-    assert np.abs(emitted).max() > 0.001  # in the end, KF-PB is right to be silent where nothing is heard of its reference
+    assert np.abs(emitted).max() > 0.001  # KF-PB becomes silent, because nothing is heard of its references
 
 
 def test_neither_weights_nor_control_signal_jump() -> None:
