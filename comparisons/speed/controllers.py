@@ -186,7 +186,6 @@ LONG: dict[str, Callable[[int], Any]] = {
     "FxLMS": partial(fx_lms, secondary=PLANT, step_size=1e-9),
     "frequency-domain FxLMS": _blocks,
     "... with one partition": lambda taps: _blocks(taps, partition_size=taps),
-    "... unconstrained": partial(_blocks, constrained=False),
 }
 
 

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from scipy.fft import irfft, next_fast_len, rfft
 
 from .._types import NumberOrArray
-from .._validate import as_choice, as_count, as_positive
+from .._validate import as_count, as_positive
 from ..checkpoint import Checkpointed
 from ..core.block import LOUDEST, LOUDEST_LEARNT
 from ..plant import Secondary
@@ -43,13 +43,11 @@ class FrequencyDomainController(Channels, BlockProcessing, Checkpointed):
         step_size: float,
         block_size: int,
         partition_size: int | None,
-        constrained: bool,
         forgetting: float | None,
         n_references: int,
     ) -> None:
         self.step_size = as_positive(step_size, "step_size")
         self.forgetting = None if forgetting is None else as_forgetting(forgetting)
-        self.constrained = as_choice(constrained, "constrained", (True, False))
         self.n_taps = as_count(n_taps, "n_taps")
         path = self._read_paths(secondary, n_references)
         B = self.block_size = as_count(block_size, "block_size")
@@ -57,10 +55,6 @@ class FrequencyDomainController(Channels, BlockProcessing, Checkpointed):
         if N % B:
             raise ValueError(
                 f"partition_size must be a multiple of block_size = {B}, got {N}: spectra of earlier blocks are used again"
-            )
-        if not self.constrained and self.n_taps % N:
-            raise ValueError(
-                f"n_taps must be a multiple of partition_size = {N} without the constraint, got {self.n_taps}"
             )
         K, J, I = self.n_microphones, self.n_loudspeakers, self.n_references  # noqa: E741
         P = self.n_partitions = -(-self.n_taps // N)
@@ -208,11 +202,9 @@ class FrequencyDomainController(Channels, BlockProcessing, Checkpointed):
 
     def _constrain(self, step: np.ndarray) -> None:
         """Set the taps beyond the partitions to zero."""
-        chosen = step if self.constrained else step[:, :, :1]
-        taps = self._partitions(chosen)
-        if self.constrained:
-            taps[:, :, -1, self.n_taps - (self.n_partitions - 1) * self.partition_size :] = 0.0
-        chosen[:] = rfft(taps, self._size)
+        taps = self._partitions(step)
+        taps[:, :, -1, self.n_taps - (self.n_partitions - 1) * self.partition_size :] = 0.0
+        step[:] = rfft(taps, self._size)
 
     # Samples.
 
@@ -330,7 +322,6 @@ def frequency_domain_fx_lms(
     step_size: float,
     block_size: int,
     partition_size: int | None = None,
-    constrained: bool = True,
     forgetting: float | None = 0.9,
     n_references: int = 1,
 ) -> FrequencyDomainController:
@@ -381,11 +372,6 @@ def frequency_domain_fx_lms(
     partition_size : int, optional
         Taps N of a partition, a multiple of B; by default B. With at least `n_taps`, there is one partition. The result
         of the block LMS does not depend on this size.
-    constrained : bool, default True
-        False leaves out C except in the first partition, where the delayless control signal needs it. This saves most
-        of the transforms. But each partition then also has taps that repeat those of its neighbours (`weights` leaves
-        them out) and vary within a block, so the secondary path must be much shorter than a block, and the weights
-        settle only near the best filter.
     forgetting : float or None, default 0.9
         Forgetting factor, per block, of the mean powers. None gives the block LMS, without M.
 
@@ -398,12 +384,11 @@ def frequency_domain_fx_lms(
     ------
     ValueError
         A step size that is not positive and finite; sizes below 1; a partition size that is not a multiple of the block
-        size; without the constraint, `n_taps` that is not a multiple of the partition size; a path that is all zeros
-        or not FIR.
+        size; a path that is all zeros or not FIR.
 
     Notes
     -----
-    A block takes some ``4 P`` transforms of ``N + B`` samples with the constraint, and a fixed number without. If the
+    A block takes some ``4 P`` transforms of ``N + B`` samples. If the
     secondary path is longer than a block, the step size must be smaller. For a limiter, wrap it in a
     `LimitedController`. References above 1e20 and errors above 1e100 are refused.
 
@@ -435,7 +420,6 @@ def frequency_domain_fx_lms(
         step_size=step_size,
         block_size=block_size,
         partition_size=partition_size,
-        constrained=constrained,
         forgetting=forgetting,
         n_references=n_references,
     )

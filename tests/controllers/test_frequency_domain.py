@@ -92,19 +92,14 @@ def near_wiener(**settings: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("settings", "loss_db"),
-    [
-        pytest.param({}, 0.3, id="partitions"),
-        pytest.param({"partition_size": 128}, 0.3, id="one partition"),
-        pytest.param({"constrained": False}, 1.0, id="unconstrained"),
-    ],
+    "settings", [pytest.param({}, id="partitions"), pytest.param({"partition_size": 128}, id="one partition")]
 )
-def test_it_settles_near_the_best_filter(settings: dict[str, Any], loss_db: float) -> None:
-    """In 4 s, on a colour that the LMS of one step size needs minutes for."""
+def test_it_settles_near_the_best_filter(settings: dict[str, Any]) -> None:
+    """Within 0.4 dB in 4 s, on a colour that the LMS of one step size needs minutes for."""
     x, d = coloured(8.0)
     _, e = closed_loop(near_wiener(**settings), x, d)
     best = wiener_solution(x, Plant(SECONDARY, fs=FS), n_taps=128, disturbance=d).noise_reduction_db
-    assert abs(best - loss_db / 2 - noise_reduction_db(e, d[-e.size :])) < loss_db / 2 + 0.1
+    assert -0.1 < best - noise_reduction_db(e, d[-e.size :]) < 0.4
 
 
 # ---- Tones, and what comes after near silence
@@ -215,8 +210,6 @@ def test_the_error_stays_bounded(
     ("options", "message"),
     [
         ({"partition_size": 12}, "multiple of block_size = 8"),
-        ({"n_taps": 20, "constrained": False}, "n_taps must be a multiple of partition_size = 8"),
-        ({"constrained": "no"}, "constrained must be one of True, False, got 'no'"),
         ({"secondary": np.zeros(4)}, "secondary must not be all zeros"),
         ({"forgetting": 1.5}, "forgetting must be 1 at most"),
     ],

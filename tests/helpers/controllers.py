@@ -128,9 +128,6 @@ SEVERAL: dict[str, Any] = {
 IN_BLOCKS: dict[str, Any] = {
     "frequency domain": lambda: frequency_domain_fx_lms(N_TAPS, S_HAT, step_size=0.2, block_size=7),
     "block LMS": lambda s=S_HAT: frequency_domain_fx_lms(N_TAPS, s, step_size=MU, block_size=14, forgetting=None),
-    "unconstrained": lambda: frequency_domain_fx_lms(
-        56, S_HAT, step_size=0.1, block_size=7, partition_size=28, constrained=False
-    ),
     "frequency domain, many": lambda: frequency_domain_fx_lms(
         L, PATHS, step_size=0.1, block_size=7, partition_size=14, **MANY
     ),
