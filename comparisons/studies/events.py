@@ -247,11 +247,9 @@ def main(runs: Runs) -> StudyReport:
     lines: list[list[str | float]] = [
         [
             row.event,
-            *row.lost_db[:4],
-            row.lost_db[-1],
-            row.loudest_second_db,
-            row.loudest_tenth_db,
-            row.power,
+            *(round(level, 1) + 0.0 for level in (*row.lost_db[:4], row.lost_db[-1])),
+            *(round(level, 1) + 0.0 for level in (row.loudest_second_db, row.loudest_tenth_db)),
+            round(row.power, 2),
             row.alarms,
         ]
         for row in rows
