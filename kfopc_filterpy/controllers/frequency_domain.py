@@ -331,7 +331,7 @@ def frequency_domain_fx_lms(
     transforms of N + B samples. The control signal has no delay: what the samples before the block contribute to it is
     computed when the block begins, and what the block's own samples contribute takes B multiplications per sample,
 
-    .. math:: y(n_0 + i) = \sum_{l=0}^{i} w_l\, x(n_0 + i - l) + \sum_{l>i} w_l\, x(n_0 + i - l)
+    .. math:: y(n_0 + i) = \Big(\sum_{l=0}^{i} + \sum_{l>i}\Big) w_l\, x(n_0 + i - l)
 
     With :math:`X'_p` the spectrum of the filtered reference that partition p of the control filter sees, and E that of
     the block's errors after zeros,

@@ -107,7 +107,7 @@ static int update_fxnlms(anc_view *view, const real *error)
     const real energy = filtered_energy(s), heard = energy_of(s, &s->x, 0, s->I), L = (real)s->L;
     const real usual = *f->usual > 0 ? *f->usual : energy, slow = 1 / (HELD * L);
     const real epsilon = *s->setting[REGULARIZATION];
-    *f->over = epsilon > 0 ? epsilon + energy : larger(energy, QUIET * usual);
+    *f->over = epsilon > 0 ? epsilon + energy : energy > 0 ? larger(energy, QUIET * usual) : 0;
     const int refused = update(view, error, fxnlms_step);
     if (refused) return refused;
     *f->usual = flushed(held_value(usual, energy, 1 - slow, 1 + RISE / L));

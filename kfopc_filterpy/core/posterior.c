@@ -11,8 +11,10 @@ static const real FOREIGN = 16;
 /* What a block leaves to the next of a sound that is longer than the paths: a reverberation time of
  * 0.64 s. */
 static const real FADES = (real)0.5;
-/* A surprise is located to this part of a block. A fit begins when one in NEWS is new. */
-enum { EIGHTHS = 8, NEWS = 8 };
+/* A surprise is located to this part of a block. */
+enum { EIGHTHS = 8 };
+/* A fit begins when this share of the data is new. */
+static const real NEWS = (real)0.125;
 /* Operations of a factorisation in a block, 2^26. */
 static const double WORK = 67108864;
 
@@ -178,7 +180,7 @@ static int is_news(const posterior *f)
     real held[3];
     weigh_data(f, held);
     for (int i = 0; i < 3; i++)
-        if (held[i] * (1 - (real)1 / NEWS) > f->numbers->fitted[i]) return 1;
+        if (held[i] * (1 - NEWS) > f->numbers->fitted[i]) return 1;
     return 0;
 }
 
