@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import Plant, kf_pb, power_constrained_wiener
+from kfopc_filterpy import Plant, kf_pb, power_constrained_wiener, simulate
 from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.signals import band_limited_noise
@@ -30,19 +30,34 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Event:
-    """A run: what is heard, what becomes of the secondary path, and what a filter could do that knows all of it."""
+    """A run: what is heard, what becomes of the plant, and what a filter could do that knows all of it."""
 
     name: str
     reference: np.ndarray  # as the controller hears it
     disturbance: np.ndarray  # with sensor noise
-    paths: tuple[tuple[int, np.ndarray], ...]  # the secondary path from a sample on, in turn
+    plant: Plant  # with the secondary path, which may change
     begins: int  # sample of the event
     judged: int  # sample from which on the losses are counted: its end
     sound: np.ndarray  # the reference without faults, of which the bound knows
     limit: float = np.inf  # at which the error microphone clips
     settings: dict[str, Any] = field(default_factory=dict)
-    fs: float = FS
     rated_power: float = RATED
+
+
+class ClippingMicrophone:
+    """A controller behind an error microphone that clips."""
+
+    def __init__(self, controller: Any, limit: float) -> None:
+        self.controller, self.limit = controller, limit
+
+    def control_signal(self, reference: float) -> float:
+        """Return the controller's control signal."""
+        y: float = self.controller.control_signal(reference)
+        return y
+
+    def update(self, error: float) -> None:
+        """Let the controller adapt to what the microphone delivers."""
+        self.controller.update(min(max(error, -self.limit), self.limit))
 
 
 @dataclass(frozen=True)
@@ -62,7 +77,7 @@ def scene(
     before_s: float,
     *,
     primary: Callable[[np.ndarray], np.ndarray] = lambda d: d,
-    secondary: np.ndarray = SECONDARY,
+    secondary: np.ndarray | None = None,
     gain: Callable[[np.ndarray], np.ndarray] | None = None,
     heard: Callable[[np.ndarray], np.ndarray] | None = None,
     lasting_s: float = 0.0,
@@ -83,7 +98,9 @@ def scene(
     d += SENSOR_NOISE * np.random.default_rng(SEED + 1).standard_normal(n)
     reference = x if heard is None else heard(x)
     own = {key: settings.pop(key) for key in ("limit", "rated_power") if key in settings}
-    return Event(name, reference, d, ((0, SECONDARY), (at, secondary)), at, end, x, settings=settings, fs=fs, **own)
+    plant = Plant(SECONDARY, fs=fs)
+    plant = plant if secondary is None else plant.changed_at(before_s, secondary=secondary)
+    return Event(name, reference, d, plant, at, end, x, settings=settings, **own)
 
 
 def _late(d: np.ndarray, taps: int = 5) -> np.ndarray:
@@ -159,15 +176,16 @@ def events() -> dict[str, Callable[[], Event]]:
 
 def bound_error(event: Event) -> np.ndarray:
     """Return the error of each second's own best filter within the rating, with the plant as it is after the event."""
+    fs, n = round(event.plant.fs), event.disturbance.size
     a, past = event.judged, min(event.judged, 4 * N_TAPS)
-    part = slice(a - past, a + (event.disturbance.size - a) // round(event.fs) * round(event.fs))
+    part = slice(a - past, a + (n - a) // fs * fs)
     with reachable_weights():
         bound = power_constrained_wiener(
             event.sound[part],
-            Plant(event.paths[-1][1], fs=event.fs),
+            event.plant.at(n / fs),
             n_taps=N_TAPS,
             disturbance=event.disturbance[part],
-            switch_on_s=past / event.fs,
+            switch_on_s=past / fs,
             rated_power=event.rated_power,
         )
     error: np.ndarray = bound.per_second.error
@@ -176,17 +194,9 @@ def bound_error(event: Event) -> np.ndarray:
 
 def played(event: Event, controller: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the error and the control signal of a run, from the first sample on."""
-    n = event.reference.size
-    taps = max(path.size for _, path in event.paths)
-    y, e = np.zeros(taps + n), event.disturbance.copy()
-    ends = [begin for begin, _ in event.paths[1:]] + [n]
-    for (begin, path), end in zip(event.paths, ends, strict=True):
-        flipped = path[::-1]
-        for t in range(begin, end):
-            y[taps + t] = controller.control_signal(event.reference[t])
-            e[t] -= flipped @ y[taps + t + 1 - path.size : taps + t + 1]
-            controller.update(min(max(e[t], -event.limit), event.limit))
-    return e, y[taps:]
+    heard = controller if event.limit == np.inf else ClippingMicrophone(controller, event.limit)
+    run = simulate(heard, event.reference, event.plant, disturbance=event.disturbance)
+    return run.error, run.control_signal
 
 
 def over_seconds(signal: np.ndarray, n: int) -> np.ndarray:
@@ -196,7 +206,7 @@ def over_seconds(signal: np.ndarray, n: int) -> np.ndarray:
 
 def judge(event: Event, error: np.ndarray, y: np.ndarray, alarms: int) -> EventRow:
     """Return the figures of a run."""
-    fs = round(event.fs)
+    fs = round(event.plant.fs)
     best = bound_error(event)
     own = error[event.judged : event.judged + best.size]
     lost = 10 * np.log10(over_seconds(own, fs) / over_seconds(best, fs))
@@ -213,14 +223,14 @@ def judge(event: Event, error: np.ndarray, y: np.ndarray, alarms: int) -> EventR
         [float(v) for v in lost],
         loudest(fs),
         loudest(fs // 10),
-        overshoot(y, event.rated_power, event.fs, window_s=averaging_s),
+        overshoot(y, event.rated_power, event.plant.fs, window_s=averaging_s),
     )
 
 
 def event_row(name: str) -> EventRow:
     """Run KF-PB through an event."""
     event = events()[name]()
-    controller = kf_pb(N_TAPS, SECONDARY, rated_power=event.rated_power, fs=event.fs, **event.settings)
+    controller = kf_pb(N_TAPS, SECONDARY, rated_power=event.rated_power, fs=event.plant.fs, **event.settings)
     return judge(event, *played(event, controller), controller.alarms)
 
 

@@ -2,29 +2,46 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from comparisons.studies import events as study
-from kfopc_filterpy import Plant, kf_pb, simulate
+from kfopc_filterpy import kf_pb
 
 
-def test_the_loop_of_the_study_is_that_of_simulate() -> None:
-    event = study.scene("sign", 0.4, secondary=-study.SECONDARY)
-    controllers = [kf_pb(study.N_TAPS, study.SECONDARY, rated_power=study.RATED, fs=study.FS) for _ in range(2)]
-    n = round(1.0 * study.FS)
-    short = study.Event(
-        event.name, event.reference[:n], event.disturbance[:n], event.paths, event.begins, event.judged, event.sound[:n]
-    )
-    error, y = study.played(short, controllers[0])
-    plant = Plant(study.SECONDARY, fs=study.FS).changed_at(0.4, secondary=-study.SECONDARY)
-    result = simulate(controllers[1], short.reference, plant, disturbance=short.disturbance)
-    np.testing.assert_allclose(error, result.error, rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(y, result.control_signal)
-    assert controllers[0].alarms == controllers[1].alarms == 1
+def short(event: study.Event, duration_s: float) -> study.Event:
+    n = round(duration_s * study.FS)
+    return replace(event, reference=event.reference[:n], disturbance=event.disturbance[:n], sound=event.sound[:n])
 
 
-@pytest.mark.slow
+def test_the_secondary_path_changes_its_sign_at_the_event() -> None:
+    event = short(study.scene("sign", 0.4, secondary=-study.SECONDARY), 1.0)
+    controller = kf_pb(study.N_TAPS, study.SECONDARY, rated_power=study.RATED, fs=study.FS)
+    error, y = study.played(event, controller)
+    heard = np.convolve(y, study.SECONDARY)[: y.size]
+    heard[event.begins :] *= -1.0
+    np.testing.assert_allclose(error, event.disturbance - heard, rtol=0, atol=1e-9)
+    assert controller.alarms == 1
+
+
+def test_a_microphone_that_clips_delivers_its_limit_at_most() -> None:
+    delivered = []
+
+    class Silent:
+        def control_signal(self, reference: float) -> float:
+            return 0.0
+
+        def update(self, error: float) -> None:
+            delivered.append(error)
+
+    event = short(study.scene("clips", 0.0, limit=0.5), 0.1)
+    error, _ = study.played(event, Silent())
+    np.testing.assert_array_equal(error, event.disturbance)
+    np.testing.assert_array_equal(delivered, np.clip(error, -0.5, 0.5))
+
+
 @pytest.mark.parametrize("name", ["primary path's sign at 1 s", "noise 12 dB softer", "a reference sample of 1e4"])
 def test_the_bound_is_reached_two_seconds_after(name: str) -> None:
     """The sign of a path, an easier noise and a click: what each cost KF-PB 5 dB and more for seconds before."""
