@@ -128,17 +128,23 @@ FAULTS = {  # a function, what is right in it, and what is not
     "wrong sign of the lap": ("record", "r.out[i] = -c->spent;", "r.out[i] = c->spent;"),
     "last lap not summed": ("start_lap", "r.out[k] = rest;", ""),
 }
+FAULT_S = 10  # for a goal: a busy machine, too, proves what is right in this time
 
 
 def faults() -> list[str]:
-    """Return the faults that the theorem does not notice: a proof that cannot fail proves nothing."""
-    unseen = []
-    for name, (function, right, wrong) in FAULTS.items():
+    """Return the faults that the theorem does not notice: a proof that cannot fail proves nothing.
+
+    Each is noticed by a goal that is not proved within FAULT_S. So the right code has to be proved within that time.
+    """
+
+    def is_proved(function: str, *change: str) -> bool:
         with tempfile.TemporaryDirectory() as made:
-            path = woven(HERE / "limiter.acsl", Path(made), right, wrong)[-1]
-            if not goals(path, Path(made), "-wp-fct", function, patience_s=3):
-                unseen.append(name)
-    return unseen
+            path = woven(HERE / "limiter.acsl", Path(made), *change)[-1]
+            return not goals(path, Path(made), "-wp-fct", function, patience_s=FAULT_S)
+
+    functions = sorted({function for function, *_ in FAULTS.values()})
+    slow = [f"{function} as it is: not within {FAULT_S} s" for function in functions if not is_proved(function)]
+    return slow + [name for name, (function, *change) in FAULTS.items() if is_proved(function, *change)]
 
 
 def rounding() -> list[str]:
