@@ -193,6 +193,11 @@ def stacked(responses: Sequence[np.ndarray]) -> np.ndarray:
     return np.array([np.pad(taps, (0, longest - taps.size)) for taps in responses])
 
 
+def lengthened(paths: np.ndarray, n_taps: int) -> np.ndarray:
+    """Return paths (outputs, inputs, taps), filled with zeros to so many taps."""
+    return np.pad(paths, ((0, 0), (0, 0), (0, n_taps - paths.shape[2])))
+
+
 def secondary_paths(
     paths: PathModels, *, fs: float | None = None, n_taps: int | None = None, name: str = "secondary"
 ) -> tuple[np.ndarray, float | None]:

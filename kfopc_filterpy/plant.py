@@ -11,19 +11,19 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ._taps import feedback_paths, primary_paths, sampling_rate, secondary_paths
+from ._taps import feedback_paths, lengthened, primary_paths, sampling_rate, secondary_paths
 from ._types import PathModels
 from ._validate import as_channels, as_count, as_nonnegative, as_positive
 from .power.amplifiers import Amplifiers, amplifier_of_each
 from .signals.recordings import Recording
 
 NEVER = 2**63 - 1
-PATHS = ("secondary", "primary", "feedback")
 READERS: dict[str, Callable[..., tuple[np.ndarray, float | None]]] = {
     "secondary": secondary_paths,
     "primary": primary_paths,
     "feedback": feedback_paths,
 }
+PATHS = tuple(READERS)
 
 
 class Plant:
@@ -450,10 +450,7 @@ def schedule_of(plant: Plant, name: str) -> Schedule:
         shape = next((value.shape[:-1] for value in values if value is not None), None)
         values = [np.zeros((*shape, 1)) if value is None and shape else value for value in values]
         longest = max((value.shape[-1] for value in values if value is not None), default=0)
-        values = [
-            value if value is None else np.pad(value, ((0, 0), (0, 0), (0, longest - value.shape[-1])))
-            for value in values
-        ]
+        values = [value if value is None else lengthened(value, longest) for value in values]
     fades = [0, *(0 if name == "amplifier" else change.fade for change in own)]
     return Schedule([0, *(change.begin for change in own)], fades, values)
 

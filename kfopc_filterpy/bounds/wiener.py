@@ -280,7 +280,7 @@ class Correlations:
 class Record(ABC):
     """Samples that control filters are fitted to.
 
-    X and x' begin `n_taps` - 1 samples early, to fill the delay lines.
+    The signals x and x' begin `n_taps` - 1 samples early, to fill the delay lines.
     """
 
     x: np.ndarray

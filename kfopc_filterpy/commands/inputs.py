@@ -260,6 +260,7 @@ def _rating(own: argparse.Namespace) -> list[Any]:
 
 def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndarray) -> Uncertainty:
     """Return how far the secondary path may be wrong: from other measurements, from tolerances, or by default."""
+    from .._taps import lengthened
     from ..controllers.kf_pb import DEFAULT_UNCERTAINTY
     from ..paths import PathTolerance
     from ..paths.uncertainty import as_gain_error
@@ -279,7 +280,7 @@ def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndar
             f"--secondary-again must give paths from {J} loudspeakers to {K} microphones, once or several times"
         )
     longest = max(secondary.shape[2], others.shape[2])
-    every = [np.pad(one, ((0, 0), (0, 0), (0, longest - one.shape[2]))) for one in (secondary, others)]
+    every = [lengthened(one, longest) for one in (secondary, others)]
     return np.concatenate(every, axis=1).reshape(K, -1, J, longest).swapaxes(0, 1)
 
 

@@ -162,10 +162,12 @@ def _controller(plant: Any, options: argparse.Namespace, limit: float) -> Any:
     from .. import OutputLimiter, kf_pb
     from ..controllers import with_internal_model
 
-    n_loudspeakers = plant.taps.shape[1] if np.ndim(plant.taps) == 3 else 1
     n_references = len(np.atleast_2d(plant.references)) + options.feedback * len(np.atleast_2d(plant.errors))
     several = np.ndim(plant.taps) == 3 or n_references > 1
-    limiters = [OutputLimiter(options.rated_power, fs=plant.fs, amplitude_limit=limit) for _ in range(n_loudspeakers)]
+    limiters = [
+        OutputLimiter(options.rated_power, fs=plant.fs, amplitude_limit=limit)
+        for _ in range(plant.plant.n_loudspeakers)
+    ]
     controller = kf_pb(
         options.taps,
         plant.taps,

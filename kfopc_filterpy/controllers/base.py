@@ -16,6 +16,7 @@ from ..checkpoint import Checkpointed
 from ..core.block import InUse
 from ..core.run_loop import Steps
 from ..power.constraint import Constraints, OutputPowerConstraint
+from .making import require_rated_power
 from .processing import BlockProcessing
 
 
@@ -46,8 +47,7 @@ def constraint_for(
     Its sample rate is `fs`, or that of the path, in Hz. Several rated powers or constraints, one for each loudspeaker,
     give a tuple.
     """
-    if (rated_power is None) == (constraint is None):
-        raise ValueError("give either rated_power= or constraint=, an OutputPowerConstraint")
+    require_rated_power(rated_power, constraint)
     if constraint is None:
         rate, powers = as_run_rate(fs, path_fs), np.asarray(rated_power)
         if powers.ndim == 1:
@@ -91,11 +91,11 @@ def differing_counts(controller: Any, **counts: int) -> Iterator[tuple[str, int]
             yield name, own
 
 
-def as_forgetting(value: Any, name: str = "forgetting") -> float:
+def as_forgetting(value: Any) -> float:
     """Return a forgetting factor, checked."""
-    forgetting = as_positive(value, name)
+    forgetting = as_positive(value, "forgetting")
     if forgetting > 1.0:
-        raise ValueError(f"{name} must be 1 at most, got {forgetting:g}: 1 forgets nothing")
+        raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
     return forgetting
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from .._taps import lengthened
 from .._validate import as_count, as_number
 from ..plant import estimated_secondary
 from .base import require_rates
@@ -72,4 +73,4 @@ class Channels:
             )
         if self._path_fs is not None:
             require_rates(self._path_fs, {"new secondary path": rate})
-        return np.pad(taps, ((0, 0), (0, 0), (0, present[-1] - taps.shape[-1]))).reshape(present)
+        return lengthened(taps, present[-1]).reshape(present)

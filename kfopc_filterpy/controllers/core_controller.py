@@ -123,7 +123,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
             path=path,
             settings=self._checked_settings(settings),
         )
-        block.fields["amplifier"][0, 0] = models.view(np.float64).reshape(self.n_loudspeakers, -1)
+        block.fields["amplifier"][0, 0] = models
         self._use_block(block)
 
     def __getattr__(self, name: str) -> Any:

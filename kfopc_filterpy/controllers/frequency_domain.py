@@ -20,9 +20,7 @@ from .processing import BlockProcessing, block_signals, checked_block
 RIDGE = 0.01  # of the mean power of all bins, added to that of each: the noise may leave bins empty
 SPREAD = 0.5  # a tenth is too little for tones in the middle of a bin; the edges of a band converge slower with more
 QUIET = 1e-3  # of the usual power: below it, the weights would follow the noise of the microphones
-HELD = (
-    1000.0  # filter lengths in which the usual power, that of which the weights were learned, changes by a factor of e
-)
+HELD = 1000.0  # filter lengths in which the usual power, that of what was learned from, changes by a factor of e
 RISE, YOUNG = 4.0, 2.0  # for the first YOUNG of them it may rise by e^RISE in each: a bad sample is not usual
 UNHEARD = 100.0  # times the usual amplitude: a past that is so soft teaches little but the noise of the microphones
 MOST_WEIGHT = 1e80  # a step that leads beyond it is left out; the error of such weights is below LOUDEST: they adapt on
@@ -357,9 +355,8 @@ def frequency_domain_fx_lms(
        \Lambda_k = P g \Big(\frac{11}{12}\, \overline{|X'_k|^2} +
        \sum_{j \ne 0} \frac{\overline{|X'_{k-j}|^2}}{4 \pi^2 j^2} + \text{ridge}\Big)
 
-    The factor g is 1 in steady noise. It
-    raises a mean that lags behind: to the power that the newest references will have behind the secondary path, and in
-    a quiet passage to a thousandth of the usual power.
+    The factor g is 1 in steady noise. It raises a mean that lags behind: to the power that the newest references will
+    have behind the secondary path, and in a quiet passage to a thousandth of the usual power.
 
     Parameters
     ----------

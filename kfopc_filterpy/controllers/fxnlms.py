@@ -19,15 +19,15 @@ def fx_nlms(
     n_references: int = 1,
     limiter: Limiters = None,
 ) -> CoreController:
-    r"""Return fx_nlms, normalised FxLMS: the step is divided by the energy of the filtered reference.
+    r"""Return FxNLMS, normalised FxLMS: the step is divided by the energy of the filtered reference.
 
     .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{x'(n)^T x'(n)}
 
     One step size therefore suits soft and loud noise. In a quiet passage, the energy counts as at least a thousandth of
     the usual one; otherwise the weights would follow the noise of the microphones. The usual energy is that of the last
-    thousand filter lengths. Weights that were learned of a reference 40 dB softer begin anew, as they hold little but that
-    noise. With a regularization, neither holds. With several channels, the steps of all filters are divided by the same energy, that of all
-    filtered references together. So their direction remains that of the multiple-error LMS:
+    thousand filter lengths. Weights that were learned from a reference 40 dB softer begin anew, as they hold little but
+    that noise. With a regularization, neither holds. With several channels, the steps of all filters are divided by the
+    same energy, that of all filtered references together. So their direction remains that of the multiple-error LMS:
 
     .. math:: w_{ji}(n+1) &= w_{ji}(n) \\ &\quad + \mu \frac{\sum_k e_k(n)\, x'_{kji}(n)}
        {\sum_{k,j,i} x'_{kji}(n)^T x'_{kji}(n)}

@@ -26,19 +26,21 @@ BLOCK_S = 0.032  # from one posterior to the next, at least
 MEMORY_S = 5.0  # time constant of what is known of the plant: it follows a drift of a tenth of the path in a second
 # What is known about the plant: fields of the core's posterior.
 POSTERIOR = (
-    *(
-        "posterior",
-        "posterior_counts",
-        "fits",
-        "theta",
-        "noise",
-        "draws",
-        "data",
-        "data_of_errors",
-        "error_energy",
-        "factor",
-    ),
-    *("inverse_diagonal", "set_aside_of_errors", "set_aside_energy", "path_correlation", "cross_correlation"),
+    "posterior",
+    "posterior_counts",
+    "fits",
+    "theta",
+    "noise",
+    "draws",
+    "data",
+    "data_of_errors",
+    "error_energy",
+    "factor",
+    "inverse_diagonal",
+    "set_aside_of_errors",
+    "set_aside_energy",
+    "path_correlation",
+    "cross_correlation",
 )
 
 
@@ -142,7 +144,8 @@ def kf_pb(
 
     where the expectation includes the uncertainty of p and s. The price follows from an account: over any
     `averaging_s`, the mean power is kept to the rated power (what goes beyond 1.04 times is clipped), and what is left
-    over in a quiet time can be spent in a louder one. Power is not spent where a whole rating of it would save less than half of the measurement noise.
+    over in a quiet time can be spent in a louder one. No power is spent where even the whole rated power would reduce
+    the power of the error by less than half of the measurement noise.
 
     Both paths are verified while they are used. If the errors contradict the posterior, the plant has changed, and all
     that was learned is forgotten. If the control then does more harm than good, the loudspeakers are silent until both
@@ -249,9 +252,9 @@ def block_of(fs: float) -> int:
     return max(round(BLOCK_S * fs), 1)
 
 
-def relative_spread(uncertainty: Any, secondary_path: Any) -> float:
+def relative_spread(uncertainty: Any, secondary: Any) -> float:
     """Return the relative rms error of the path as the core takes it, 0 if the path is exact."""
-    error = rms_relative_error(uncertainty, secondary_path)
+    error = rms_relative_error(uncertainty, secondary)
     if error > MOST_SPREAD:
         raise ValueError(f"secondary_path_uncertainty must be at most {MOST_SPREAD:g}, got {error:g}")
     return max(error, LEAST_SPREAD) if error > 0.0 else 0.0

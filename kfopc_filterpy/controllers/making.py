@@ -28,6 +28,6 @@ def controller_maker(make: _Maker) -> _Maker:
 
 
 def require_rated_power(rated_power: Any, constraint: Any) -> None:
-    """Raise ValueError if a controller that needs a rated power gets neither that nor a constraint."""
-    if rated_power is None and constraint is None:
+    """Raise ValueError unless a controller that needs a rated power gets either that or a constraint."""
+    if (rated_power is None) == (constraint is None):
         raise ValueError("give either rated_power= or constraint=, an OutputPowerConstraint")

@@ -48,8 +48,8 @@ const anc_algorithm anc_fxlms = {
  * filter length, by at most e^RISE, so that a bad sample does not count, and a softer one within
  * HELD filter lengths.
  *
- * When a reference is UNHEARD times as loud as those that the weights were learned of, they begin
- * anew. What they were learned of follows within HELD filter lengths, and at first, while the
+ * When a reference is UNHEARD times as loud as those that the weights were learned from, they begin
+ * anew. What they were learned from follows within HELD filter lengths, and at first, while the
  * weights are younger than YOUNG filter lengths, a louder reference at once. */
 
 enum { REGULARIZATION = STEP_SIZE + 1 };
@@ -57,7 +57,7 @@ static const real QUIET = (real)1e-3, RISE = 4, HELD = 1000, UNHEARD = (real)1e4
 typedef struct {
     signals s;
     real *usual;   /* energy of the filtered references */
-    real *learned; /* energy of the references that the weights were learned of */
+    real *learned; /* energy of the references that the weights were learned from */
     real *age;     /* of the weights, in samples */
     real *over;    /* what the step size is divided by */
 } normalised;
@@ -111,7 +111,7 @@ static int update_fxnlms(anc_view *view, const real *error)
     const int refused = update(view, error, fxnlms_step);
     if (refused) return refused;
     *f->usual = flushed(held_value(usual, energy, 1 - slow, 1 + RISE / L));
-    if (heard == 0) return ANC_DONE; /* nothing is learned of silence */
+    if (heard == 0) return ANC_DONE; /* nothing is learned from silence */
     *f->learned = *f->age < YOUNG * L ? larger(*f->learned, heard)
                                       : held_value(*f->learned, heard, 1 - slow, 1 + slow);
     *f->age += 1;

@@ -1,1 +1,1 @@
-"""The plant, and the loop over samples, whole signals and scenarios."""
+"""The loop over samples, for one controller or for several that share gains."""

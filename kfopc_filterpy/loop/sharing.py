@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .._taps import lengthened
 from ..controllers.core_controller import RECORDED as IN_CONSTRAINT
 from ..controllers.core_controller import CoreController
 from ..core.block import REASONS, Block, Shape
@@ -72,8 +73,8 @@ def run_together(runs: Sequence[Any], progress: Callable[[int], Any] | None) -> 
     first = runs[0]
     paths = [run.true.secondary for run in runs]
     longest = max(path.shape[2] for path in paths)
-    secondary = np.array([np.pad(path, ((0, 0), (0, 0), (0, longest - path.shape[2]))) for path in paths])
-    models = np.concatenate([amplifier_models(run.true.amplifiers, 1).view(np.float64).reshape(1, -1) for run in runs])
+    secondary = np.array([lengthened(path, longest) for path in paths])
+    models = np.concatenate([amplifier_models(run.true.amplifiers, 1) for run in runs])
     limits = np.concatenate([divergence_limits(run.rated_power, 1) for run in runs])
     plant = Plant(secondary, np.zeros((1, 1, 0)), models, limits)
     results = {name: np.concatenate([getattr(run.signals, name) for run in runs]) for name in RESULTS}

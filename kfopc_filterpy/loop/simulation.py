@@ -254,7 +254,7 @@ class _Run:
         self.plant = CompiledPlant(
             self.secondary.values[0][None],
             np.zeros((len(self.x), J, 0)) if feedback is None else feedback,
-            amplifier_models(None, J).view(np.float64).reshape(J, -1),
+            amplifier_models(None, J),
             divergence_limits(self.rated_power, J),
         )
         results = [np.full((channels, n_samples), np.nan) for channels in (K, J, J, K)]
@@ -312,7 +312,7 @@ class _Run:
         each, last = self.amplifiers.at(n + self.on)
         self.functions = [amplifier if compiled_model(amplifier) is None else None for amplifier in each]
         models = [None if function else one for one, function in zip(each, self.functions, strict=True)]
-        self.plant.amplifiers[:] = amplifier_models(models, len(models)).view(np.float64).reshape(len(models), -1)
+        self.plant.amplifiers[:] = amplifier_models(models, len(models))
         return min(one, other, last) - self.on
 
     def _loop(self, looped: Looped) -> tuple[bool, int]:

@@ -180,7 +180,7 @@ def rms_relative_error(uncertainty: Uncertainty | None, secondary: Secondary) ->
     weights = np.sum(np.abs(_response(paths)) ** 2, axis=(1, 2))
     weights = weights if np.any(weights > 0.0) else np.ones(N_FREQUENCIES)
     weights[[0, -1]] *= 0.5  # each other frequency stands for two of the whole circle
-    return float(np.sqrt(np.average(path_uncertainty(stated, secondary) ** 2, weights=weights)))
+    return float(np.sqrt(np.average(path_uncertainty(stated, paths) ** 2, weights=weights)))
 
 
 def as_uncertainty(value: Uncertainty | None) -> PathTolerance | float | np.ndarray | None:
@@ -274,29 +274,30 @@ def guard_filter(uncertainty: Uncertainty | None, secondary: Secondary) -> np.nd
     >>> share[[64, 128, 160, 224]].round(2)  # at 1/8, 1/4, 5/16 and 7/16 of the sample rate
     array([1.  , 0.66, 0.56, 0.03])
     """
-    share = allowed_share(uncertainty, secondary)
+    paths, _ = estimated_secondary(secondary)
+    share = allowed_share(uncertainty, paths)
     stated: Any = uncertainty
     if np.all(share == 1.0) and np.ndim(stated) < 2:  # measured paths may differ from a later estimate
         return None
-    largest = np.minimum(path_uncertainty(uncertainty, secondary), LARGEST_ERROR)
+    largest = np.minimum(path_uncertainty(uncertainty, paths), LARGEST_ERROR)
     share = np.maximum(share, np.minimum(LEAST_SHARE, LEAST_LOOP_GAIN / np.maximum(largest, 1.0)))
     penalty = np.maximum((1.0 - share) / share, SMALLEST_PENALTY)
-    loop_gain = LARGEST_LOOP_GAIN if _knows_phase(uncertainty, secondary) else LARGEST_LOOP_GAIN_OF_SIZE
+    loop_gain = LARGEST_LOOP_GAIN if _knows_phase(uncertainty, paths) else LARGEST_LOOP_GAIN_OF_SIZE
     return _short_filter(penalty, largest / loop_gain - 1.0)
 
 
 def allowed_share(uncertainty: Uncertainty | None, secondary: Secondary) -> np.ndarray:
     """Return the part g of the control filter that an uncertainty allows, (257,), from 0 to fs/2."""
     paths, _ = estimated_secondary(secondary)
-    if _knows_phase(uncertainty, secondary):
+    if _knows_phase(uncertainty, paths):
         limit = LARGEST_PHASE_DEG if paths.shape[1] == 1 else LARGEST_PHASE_OF_SEVERAL_DEG
         return uncertainty.share(OMEGA, largest_phase_deg=limit)
-    return 1.0 - np.minimum(path_uncertainty(uncertainty, secondary), 1.0) ** SHARPNESS
+    return 1.0 - np.minimum(path_uncertainty(uncertainty, paths), 1.0) ** SHARPNESS
 
 
-def _knows_phase(uncertainty: Any, secondary: Secondary) -> TypeGuard[PathTolerance]:
+def _knows_phase(uncertainty: Any, paths: np.ndarray) -> TypeGuard[PathTolerance]:
     """Return whether the phase of the error is limited, and errors at one microphone do not disturb another one."""
-    n_microphones, n_loudspeakers = estimated_secondary(secondary)[0].shape[:2]
+    n_microphones, n_loudspeakers = paths.shape[:2]
     return isinstance(uncertainty, PathTolerance) and n_microphones <= n_loudspeakers
 
 

@@ -155,11 +155,11 @@ def amplifier_of_each(amplifier: Any, n_loudspeakers: int) -> list[Any]:
 
 
 def amplifier_models(amplifier: Amplifier | Sequence[Amplifier | None] | None, n_loudspeakers: int) -> np.ndarray:
-    """Return the records of the amplifier models of all loudspeakers, (J, 1)."""
+    """Return kind, limit and sharpness of the amplifier models of all loudspeakers, (J, 3)."""
     models = [compiled_model(one) for one in _each(amplifier, n_loudspeakers)]
     if len(models) != n_loudspeakers or any(model is None for model in models):
         raise TypeError(
             "amplifier must be None, one of kfopc_filterpy's amplifier models, or one for each of the "
             f"{n_loudspeakers} loudspeakers, got {amplifier!r}"
         )
-    return np.array(models)
+    return np.array(models).view(np.float64).reshape(n_loudspeakers, -1)

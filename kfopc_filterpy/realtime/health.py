@@ -51,8 +51,8 @@ class Health:
     counts : collections.Counter
         Number of events, by what happened: "not finite", "clipped", "stuck", "offset", "repeated" and "lost" samples of
         the microphones; "refused" updates; "limited" control signals; "output underflow", a block that came too late
-        for the output; "diverged: ..." and what was done about it, "muted"; "louder than before control", which ends in "diverged: louder than without control" or "the noise itself is louder"; "silent: no
-        usable input" and "running again".
+        for the output; "diverged: ..." and then "muted"; "louder than before control", which ends in "diverged: louder
+        than without control" or "the noise itself is louder"; "silent: no usable input" and "running again".
 
     Examples
     --------

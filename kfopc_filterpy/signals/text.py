@@ -112,7 +112,7 @@ def _read_table(path: str | os.PathLike[str]) -> Table:
         heading = header[-1].strip() if header else ""
         if _is_decimal(path, heading, islice(_lines(path), layout.first, None)):
             layout = layout._replace(delimiter=None, has_decimal_comma=True)
-    _require_line_end(path, layout)
+    _require_line_end(path)
     rows = (
         layout.plain(line) for line in islice(_lines(path), layout.first, None) if not _is_comment(line, layout, path)
     )
@@ -180,7 +180,7 @@ def _is_comment(line: str, layout: _Layout, path: str | os.PathLike[str]) -> boo
     return True
 
 
-def _require_line_end(path: str | os.PathLike[str], layout: _Layout) -> None:
+def _require_line_end(path: str | os.PathLike[str]) -> None:
     """Raise ValueError if a file ends within its last number: without a line end, and shorter than all before."""
     with open(path, "rb") as file:
         file.seek(max(file.seek(0, os.SEEK_END) - _END, 0))

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from scipy.signal import welch
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power, suggest_settings
-from kfopc_filterpy._taps import sampling_rate, tells_rate
 from kfopc_filterpy._validate import (
     as_channels,
     as_choice,
@@ -44,7 +43,7 @@ from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.file_checks import require_different, require_heard, require_sound
 from kfopc_filterpy.paths.timing import timing_fault
 from kfopc_filterpy.paths.uncertainty import Uncertainty, as_uncertainty
-from kfopc_filterpy.plant import Plant, as_constant_plant, checked_signals
+from kfopc_filterpy.plant import Plant, as_constant_plant, checked_signals, require_rate
 from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_remarks
 
 from .._types import ProgressBar
@@ -209,7 +208,7 @@ def assess(
     pascals = None if pascal_per_unit is None else _pascals(pascal_per_unit, K)
     if memory_s is None:
         memory_s = CHANNEL_MEMORY_S if several else MEMORY_S
-    start = switch_on_sample(switch_on_s, fs, x.shape[-1])
+    start = _start_sample(switch_on_s, fs, x.shape[-1])
     run_s = (x.shape[-1] - start) / fs
     if run_s < LEAST_RUN_S:
         raise ValueError(
@@ -270,7 +269,7 @@ def assess(
     )
     cause = None if reached >= want_db else _cause(ceilings, want_db, late >= settings.n_taps)
     volts_per_unit, ohm = (scale_of(ratings, name, several) for name in ("volts_per_unit", "ohm"))
-    watts = watt_per_power(ratings, several)
+    watts = watt_per_power(volts_per_unit, ohm)
     least = np.inf if want_db else 0.0
     if want_db and cause in (None, "amplifier", "adaptation"):
         first = required if np.all(np.isfinite(required)) else bounds.free.control_power
@@ -343,6 +342,11 @@ def recorded_signals(
     x, s = _recording(noise, "noise", plant.fs), plant.secondary
     K, J, _ = s.shape
     require_sound("secondary", s)
+    if plant.primary is not None and plant.n_references != len(x):
+        raise ValueError(
+            f"noise must have the {plant.n_references} channel(s) of the plant's primary path, got {len(x)}; leave out "
+            "the channels that do not fit"
+        )
     if disturbance is not None:
         d = _recording(disturbance, "disturbance", plant.fs, length=x.shape[1])
         _require_each_microphone(d, "disturbance", K)
@@ -355,11 +359,6 @@ def recorded_signals(
             "plant must have a primary path unless there is a disturbance: what arrives at the error microphone?"
         )
     else:
-        if plant.n_references != len(x):
-            raise ValueError(
-                f"noise must have the {plant.n_references} channel(s) of the plant's primary path, got {len(x)}; leave out "
-                "the channels that do not fit"
-            )
         _, d = checked_signals(plant, x, None)
     if not np.any(d):
         raise ValueError("disturbance must not be silent: every value is 0")
@@ -377,8 +376,7 @@ def _require_each_microphone(signals: np.ndarray, name: str, n_microphones: int)
 
 def _recording(value: Any, name: str, fs: float, length: int | None = None) -> np.ndarray:
     """Return the channels of a recording without their offsets, (channels, n_samples)."""
-    if tells_rate(value):
-        sampling_rate(value, fs, name=name)
+    require_rate(value, fs, name)
     channels = np.atleast_2d(as_channels(value, name))
     for number, channel in enumerate(channels):
         which = name if len(channels) == 1 else f"{name}[{number}]"
@@ -410,7 +408,8 @@ def _response_s(p: np.ndarray, s: np.ndarray, want_db: float, fs: float) -> floa
     return (max(lasting) + 1) / fs
 
 
-def switch_on_sample(switch_on_s: float | None, fs: float, n_samples: int) -> int:
+def _start_sample(switch_on_s: float | None, fs: float, n_samples: int) -> int:
+    """Return the sample at which the control is switched on; by default after 0.5 s, or a tenth of a shorter record."""
     duration = n_samples / fs
     time = min(0.5, 0.1 * duration) if switch_on_s is None else as_nonnegative(switch_on_s, "switch_on_s", unit="s")
     if time >= duration:
@@ -446,10 +445,6 @@ def _on_differing_path(noise: ArrayLike, plant: Plant, disturbance: ArrayLike) -
     if plant.primary is None:
         return []
     x, d = (_recording(signal, name, plant.fs) for signal, name in ((noise, "noise"), (disturbance, "disturbance")))
-    if plant.n_references != len(x):
-        raise ValueError(
-            f"noise must have the {plant.n_references} channel(s) of the plant's primary path, got {len(x)}"
-        )
     left = d - checked_signals(plant, x, None)[1]
     left_db = -reduction_db(mean_square(left), mean_square(d))
     if left_db < DIFFERING_DB:

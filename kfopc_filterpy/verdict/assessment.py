@@ -38,7 +38,7 @@ from .._types import NumberOrArray
 from .._writing import jsonable, prepare_folder, replacing_files
 from ..paths import FeedbackMargin
 from .fixed_filters import longest_filter
-from .limits import Limits
+from .limits import Limits, watt_per_power
 
 SCHEMA_VERSION = 1
 SCHEMA = Path(__file__).with_name("verdict.schema.json")
@@ -271,7 +271,7 @@ class Assessment:
     @property
     def watt_per_power(self) -> NumberOrArray | None:
         """Watts of a mean square of 1, of each of several loudspeakers; None if the impedance is not known."""
-        return None if self.ohm is None or self.volts_per_unit is None else self.volts_per_unit**2 / self.ohm
+        return watt_per_power(self.volts_per_unit, self.ohm)
 
     def __repr__(self) -> str:
         lines = [self.verdict, self.reason, self.stability, *self.advice]

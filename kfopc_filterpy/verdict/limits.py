@@ -123,19 +123,18 @@ def amplifiers(limits: Limits) -> Amplifier | Sequence[Amplifier]:
     return each if isinstance(limits, ChannelLimits) else each[0]
 
 
-def watt_per_power(ratings: Sequence[Sequence[Rating]], several: bool) -> NumberOrArray | None:
-    """Return the watts of a mean square of 1, of several loudspeakers as (J,); None if a rating does not tell them."""
-    volts, ohm = (scale_of(ratings, name, several) for name in ("volts_per_unit", "ohm"))
-    return None if volts is None or ohm is None else volts**2 / ohm
+def watt_per_power(volts_per_unit: NumberOrArray | None, ohm: NumberOrArray | None) -> NumberOrArray | None:
+    """Return the watts of a mean square of 1, of several loudspeakers as (J,); None if they are not known."""
+    return None if volts_per_unit is None or ohm is None else volts_per_unit**2 / ohm
 
 
 def scale_of(ratings: Sequence[Sequence[Rating]], name: str, several: bool) -> NumberOrArray | None:
     """Return `volts_per_unit` or `ohm` of the first rating that has volts; of several loudspeakers as (J,).
 
-    None if a loudspeaker has no such rating, or a curve instead of a number.
+    None if a loudspeaker has no such rating.
     """
     with_volts = ([one for one in own if hasattr(one, "volts_per_unit")] for own in ratings)
     found: list[Any] = [getattr(own[0], name) if own else None for own in with_volts]
     if not several:
         return found[0]
-    return np.array(found, dtype=float) if all(np.ndim(one) == 0 and one is not None for one in found) else None
+    return None if any(one is None for one in found) else np.array(found, dtype=float)
