@@ -169,15 +169,18 @@ def _two_gradients(scene: Scene, mu: float, share: float) -> dict[str, Any]:
     return _peak(scene, mu, share) | {"output_step_size": mu * scene.secondary_gain}
 
 
+def block_of(scene: Scene) -> int:
+    """Return a quarter of the control filter; in blocks of less than 16 samples, calls would take most time."""
+    return max(-(-scene.n_taps // 4), 16)
+
+
 def _in_blocks(scene: Scene, mu: float, _: float) -> dict[str, Any]:
-    """Return one partition, for fine bins, of four blocks; in blocks of less than 16 samples, calls would take most time."""
-    block = max(-(-scene.n_taps // 4), 16)
-    return {"step_size": mu, "block_size": block, "partition_size": 4 * block}
+    """Return one partition, for fine bins, of four blocks."""
+    return {"step_size": mu, "block_size": block_of(scene), "partition_size": 4 * block_of(scene)}
 
 
 def _within_power(scene: Scene, mu: float, _: float) -> dict[str, Any]:
-    """Return four blocks for the control filter, as for all that adapt once per block."""
-    return {"step_size": mu, "block_size": max(-(-scene.n_taps // 4), 16), "rated_power": scene.rated_power}
+    return {"step_size": mu, "block_size": block_of(scene), "rated_power": scene.rated_power}
 
 
 def _constrained(settings: Settings) -> Settings:

@@ -103,12 +103,14 @@ class CommandController(PlaysBlocks):
 
     def exchange(self, references: np.ndarray, errors: np.ndarray) -> np.ndarray:
         """Return the command's answer to a block."""
-        self._write(self._unsent + np.concatenate((references, errors)).astype(FLOAT).tobytes())
+        taken = self._write(self._unsent + np.concatenate((references, errors)).astype(FLOAT).tobytes())
         self._unsent = b""
         asked = FLOAT.itemsize * self._playing.size
         answer = self._stdout.read(asked)
         if len(answer) < asked:
             raise self._failure(f"answered {len(answer)} of {asked} bytes")
+        if not taken:
+            raise self._failure("took no input")
         y = np.frombuffer(answer, FLOAT).reshape(self._playing.shape)
         if not np.isfinite(y).all():
             raise EntryFailed(f"answered NaN or Inf in block {self._blocks}")
@@ -159,12 +161,14 @@ class CommandController(PlaysBlocks):
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
 
-    def _write(self, content: bytes) -> None:
+    def _write(self, content: bytes) -> bool:
+        """Return whether the command takes input; one that has ended tells more by what it answered."""
         try:
             self._stdin.write(content)
             self._stdin.flush()
         except OSError:
-            raise self._failure("took no input") from None
+            return False
+        return True
 
     def _failure(self, what: str) -> EntryFailed:
         """Return why the command failed; its output has ended, so it has ended or soon will."""

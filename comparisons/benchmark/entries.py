@@ -17,6 +17,7 @@ from kfopc_filterpy import Plant
 from kfopc_filterpy.bounds import wiener_solution
 
 from ..bench import Algorithm, algorithms
+from ..bench.registry import block_of
 from ..rivals import FastArrayKalman, FrequencyDomainKalman, SubbandFxLMS, SubfilterKalman
 from ..rivals.one_channel import OneChannel
 from ..rivals.subfilters import band_subfilters
@@ -177,9 +178,8 @@ def _fast_array(task: Any, forgotten: float, _: float) -> dict[str, Any]:
 
 
 def _frequency_kalman(task: Any, lost: float, _: float) -> dict[str, Any]:
-    """Return four blocks for the control filter, as for all that adapt once per block."""
     return {
-        "block_size": max(-(-task.n_taps // 4), 16),
+        "block_size": block_of(task),
         "transition": 1.0 - lost,
         "initial_variance": task.n_taps * task.initial_variance,  # of a bin
     }

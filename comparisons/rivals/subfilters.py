@@ -45,9 +45,8 @@ class SubfilterKalman(OneChannel):
         self.bank, self.r, self.q, self.rated_power = subfilters, state_noise, measurement_noise, rated_power
         C = len(subfilters)
         self.g, self.P = np.zeros(C), np.eye(C)
-        self.R, self.H = np.zeros(
-            (2, C, C)
-        )  # means of the products of the outputs, before and after the secondary path
+        # Means of the products of the outputs, before and after the secondary path.
+        self.R, self.H = np.zeros((2, C, C))
         self.reduction = np.eye(C)  # from the gains of the Kalman filter to those within the rated power
         self.block, self.memory = np.zeros((2, max(round(BLOCK_S * fs), 1), C)), MEMORY_S * fs
         self.n = 0

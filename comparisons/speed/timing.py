@@ -14,7 +14,6 @@ import numpy as np
 from kfopc_filterpy.verdict.items import aligned
 
 Work = tuple[Callable[[], Any], int]  # runs some samples, and how many
-Tick = Callable[[], Any]  # called after each row of a table
 
 ROUNDS = 20
 BUDGET_S = 20.0  # of all rounds; slow works, of which a round takes seconds, have fewer, and two at least

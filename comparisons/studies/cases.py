@@ -207,8 +207,8 @@ def driven_case(plant: Plant, noise: np.ndarray, overdrive_db: float) -> Scene:
 def jumping(scene: Scene, plant: Plant, span_s: tuple[float, float], gain_db: float) -> Scene:
     """Return a scene of one seed whose noise is louder between two times of the record."""
     begin_s, end_s = span_s
-    louder = level_jump(scene.references[0], begin_s, gain_db, fs=FS)
-    return heard_on(scene, plant, level_jump(louder, end_s, -gain_db, fs=FS))
+    raised = level_jump(scene.references[0], begin_s, gain_db, fs=FS)
+    return heard_on(scene, plant, level_jump(raised, end_s, -gain_db, fs=FS))
 
 
 def heard_on(scene: Scene, plant: Plant, x: np.ndarray) -> Scene:

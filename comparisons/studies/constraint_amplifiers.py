@@ -51,10 +51,10 @@ def run_amplifiers(scene: Scene, plant: Plant, case: Case, tuned: Settings) -> l
         for words, amplifier in known.items()
     ]
     estimate = path_taps(perturbed_path(scene.secondary, fs=FS, gain_db=6.0, phase_deg=45.0))
-    wrong, louder = replace(scene, secondary_estimate=estimate), jumping(clipping, plant, JUMP_S, JUMP_DB)
+    wrong, loud = replace(scene, secondary_estimate=estimate), jumping(clipping, plant, JUMP_S, JUMP_DB)
     for name in LIMITED:
         jobs.append((clipping, name, "path 6 dB, 45° off", controller_of(wrong, name, tuned)))
-        jobs.append((louder, name, f"{JUMP_DB:g} dB louder for a second", controller_of(scene, name, tuned)))
+        jobs.append((loud, name, f"{JUMP_DB:g} dB louder for a second", controller_of(scene, name, tuned)))
     return [
         ClippedRow(**case.place, algorithm=name, known=words, **figures_of(at.run(controller), scene.rated_power))
         for at, name, words, controller in jobs

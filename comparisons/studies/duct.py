@@ -126,17 +126,18 @@ def _study(
     figures = {algorithm: figures_of(result, RATED_POWER) for algorithm, result in results.items()}
     start = start_under_constraint(scene, tuned, results["KF-OPC"].constraint_factor)
     x, d = scene.settled
-    wiener = wiener_solution(x, plant, n_taps=N_TAPS, disturbance=d)
+    wiener = wiener_solution(x, plant, n_taps=scene.n_taps, disturbance=d)
     reference_gain = float(secondary_path_gain(scene.secondary, reference=x))
     control_gain = float(wiener.antinoise_power / wiener.control_power)
-    bound = power_constrained_solution(x, plant, n_taps=N_TAPS, rated_power=RATED_POWER, disturbance=d)
+    bound = power_constrained_solution(x, plant, n_taps=scene.n_taps, rated_power=RATED_POWER, disturbance=d)
     return parts.report_of_paper(
         scene,
         tuned,
         name=name,
         title=title,
         summary=(
-            f"The noise needs {scene.unconstrained_power / RATED_POWER:.3g} times the rated power of {RATED_POWER:g}, which a linear amplifier puts out. "
+            f"The noise needs {scene.unconstrained_power / RATED_POWER:.3g} times the rated power of {RATED_POWER:g}; the "
+            "amplifier is linear. "
             f"The noise: {parameters['noise'].value} ({parameters['noise'].chosen})."
         ),
         parameters=parameters

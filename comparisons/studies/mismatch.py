@@ -20,7 +20,6 @@ from .cases import BAND_HZ, FS, Case, driven_case, ducts, grid_runs, grids, nois
 from .rows import Row, column, figure_table, grouped, select, span, worst_claim
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB", "FxRLS", "FxLMS", "MOV-FxLMS", "optimal leaky FxLMS")
-UNCONSTRAINED = ("KF-ANC", "FxRLS", "FxLMS")
 KEEPS_POWER = ("KF-OPC", "KF-PB", "MOV-FxLMS")
 OVERDRIVE_DB = 3.0
 DURATION_S = 4.0

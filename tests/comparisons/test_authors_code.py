@@ -46,13 +46,20 @@ class Case:
         np.testing.assert_allclose(control_signal, self.of(f"{algorithm}/control_signal"), rtol=0, atol=1e-10)
 
 
-@pytest.fixture(params=CASES)
-def case(request: pytest.FixtureRequest, shared_data: Path, data_folder: Callable[[Any], None]) -> Case:
+@pytest.fixture
+def authors_runs(shared_data: Path) -> Any:
     runs = shared_data / "author_code" / "runs.npz"
     if not runs.is_file():
         pytest.skip(f"no runs of the authors' code: {runs} is not there")
+    return np.load(runs)
+
+
+@pytest.fixture(params=CASES)
+def case(
+    request: pytest.FixtureRequest, shared_data: Path, authors_runs: Any, data_folder: Callable[[Any], None]
+) -> Case:
     data_folder(shared_data)
-    return Case(np.load(runs), request.param)
+    return Case(authors_runs, request.param)
 
 
 def test_a_fixed_penalty_is_the_authors(case: Case) -> None:
@@ -105,16 +112,15 @@ def test_mov_mfxlms_is_the_authors_but_for_the_powers(case: Case) -> None:
     assert noise_reduction_db(result.error, case.d) == pytest.approx(theirs, abs=0.002)
 
 
-def test_the_studies_have_the_authors_settings(shared_data: Path) -> None:
+def test_the_studies_have_the_authors_settings(authors_runs: Any) -> None:
     """Their band-pass paths bit for bit, their window, their tone to 1 %, and their compressor of unit variance."""
-    runs = np.load(shared_data / "author_code" / "runs.npz")
     plant = AUTHORS.plant()
-    np.testing.assert_array_equal(plant.primary[0, 0], runs["broadband/primary"])
-    np.testing.assert_array_equal(plant.secondary[0, 0], runs["broadband/secondary"])
+    np.testing.assert_array_equal(plant.primary[0, 0], authors_runs["broadband/primary"])
+    np.testing.assert_array_equal(plant.secondary[0, 0], authors_runs["broadband/secondary"])
     assert (AUTHORS.n_taps, AUTHORS.memory_s * 16000, AUTHORS.window) == (256, WINDOW, "sliding")
     sine = tone(400.0, 1.5, fs=16000)
     scene = AUTHORS.scene({0: sine}, plant, rated_power=tonal.RATED_POWER, power_multiple=tonal.POWER_MULTIPLE)
-    assert np.max(scene.references[0]) == pytest.approx(np.max(runs["tone/reference"]), rel=0.01)
+    assert np.max(scene.references[0]) == pytest.approx(np.max(authors_runs["tone/reference"]), rel=0.01)
     assert np.sqrt(2.0) == tonal.LIMIT
     noise = np.random.default_rng(0).standard_normal(16000)
     short = Plant([1.0], [0.0, 1.0], fs=16000)

@@ -182,8 +182,8 @@ def test_the_error_stays_bounded(
 ) -> None:
     """One noise follows another at another level, which jumps or fades in; paths that no block is shorter than.
 
-    By UNHEARD, a hundred times the loudest disturbance so far: weights that follow sensor noise count for 40 dB. It is
-    less than ten times in nearly all examples, and 1e7 and more without what is tested here.
+    The bound is UNHEARD, a hundred, times the loudest disturbance so far: weights that follow sensor noise may reach
+    40 dB. It is less than ten times in nearly all examples, and 1e7 and more without what is tested here.
     """
     rng, n, g = np.random.default_rng(seed), 5000, 10 ** (level_db / 20)
     first, x = (noise_of(kind, n, rng) for kind in kinds)

@@ -41,9 +41,6 @@ def assert_kept(y: np.ndarray, rated_power: float = RATED_POWER) -> None:
     assert worst_window(y) <= rated_power * (1 + 1e-9)
 
 
-# ---- In the loop
-
-
 # ---- The bound
 
 

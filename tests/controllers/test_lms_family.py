@@ -193,15 +193,12 @@ def noises(n: int = 400, n_references: int = I) -> np.ndarray:
     return np.random.default_rng(3).standard_normal((n_references, n))
 
 
-def fxlms(path: Any = ESTIMATES) -> fx_lms:
+def fxlms(path: Any = ESTIMATES) -> Any:
     return fx_lms(L, path, step_size=0.01, n_references=I)
 
 
 def run(controller: Any, x: np.ndarray) -> Any:
     return simulate(controller, x, Plant(PATHS, PRIMARY, fs=FS))
-
-
-# ---- Several channels: where they settle
 
 
 def test_a_normalised_step_does_not_depend_on_the_level_and_is_stable_up_to_2() -> None:

@@ -104,7 +104,7 @@ def test_the_interpreter_lock_is_released() -> None:
     """This thread sees a block half done: with the lock held it could only look before the call, or after it."""
     controller = kf_anc(512, S, state_noise=1e-9, measurement_noise=1.0)
     half_done = False
-    for _ in range(10):  # on a busy machine, this thread may not get a turn in time
+    for _ in range(200):  # on a busy machine, this thread may not get a turn in time
         y = np.full_like(X, np.nan)
         thread = threading.Thread(target=controller.process, args=(X, E), kwargs={"out": y})
         thread.start()

@@ -185,7 +185,7 @@ def test_an_output_depends_on_no_input_of_the_same_moment(opened):
 
 
 @pytest.mark.parametrize("command", ["gcc", "clang"])
-def test_the_sources_compile_as_their_description_says(command, opened, tmp_path):
+def test_the_sources_compile_as_their_description_says(command, opened):
     unit = opened("KF-PB", "float32")
     sources = f"{unit.folder}/sources"
     described = ElementTree.parse(f"{sources}/buildDescription.xml").find(".//SourceFileSet")

@@ -144,3 +144,5 @@ def test_a_silent_reference_at_the_start_is_none(kind: str) -> None:
     for _ in range(30):
         kf.predict()
         kf.update(0.1, H=np.zeros((1, TAPS)))
+    assert kf.constraint_factor == 1.0
+    assert not np.any(kf.x)

@@ -33,10 +33,8 @@ WORTHWHILE = 0.5  # a rating of power must save at least this share of the measu
 MOST = 1.04  # of the account, that is never exceeded: what goes beyond it is clipped
 WINDOWS, WINDOW_S = 8, 1.25  # windows of x in the averaging time, and a window's longest time constant
 SHORTER = 5  # a window for the level of x than that for its spectrum
-WINDOW_LASTS, BLOCK_LASTS = (
-    4,
-    20,
-)  # parts of the averaging time for which the powers of the last window and block may go on
+# Parts of the averaging time for which the powers of the last window and block may go on.
+WINDOW_LASTS, BLOCK_LASTS = 4, 20
 
 
 def lagged(u, e, n):
@@ -48,10 +46,8 @@ def gram(u, v, B, n, m):
     """Return sum_t u(t - i) v(t - j), i < n, j < m, over the last B samples t."""
     G = np.empty((n, m))
     G[0], G[:, 0] = lagged(v, u[-B:], m), lagged(u, v[-B:], n)
-    (a, b), (c, d) = (
-        (u[::-1], v[::-1]),
-        (u[-B - 1 :: -1], v[-B - 1 :: -1]),
-    )  # newest first: at the end, before the block
+    # Newest first: at the end, before the block.
+    (a, b), (c, d) = (u[::-1], v[::-1]), (u[-B - 1 :: -1], v[-B - 1 :: -1])
     for i in range(1, n):  # along the diagonals, the window of t moves by one sample
         G[i, 1:] = G[i - 1, :-1] + c[i - 1] * d[: m - 1] - a[i - 1] * b[: m - 1]
     return G

@@ -109,14 +109,11 @@ def controlled(
     *,
     x: Any = NOISE,
     secondary: Any = S,
-    from_4_s: Any = None,
     disturbance: Any = None,
     **changed: Any,
 ) -> Any:
-    """Return supervisor, errors and disturbances of a run to the end of the noise, with another path from 4 s on."""
+    """Return supervisor, errors and disturbances of a run to the end of the noise."""
     plant = Plant(secondary, PRIMARY if disturbance is None else None, fs=FS)
-    if from_4_s is not None:
-        plant = plant.changed_at(4.0, secondary=from_4_s)
     interface = SimulatedInterface(x, plant, disturbance=disturbance, block=BLOCK, latency=BLOCK)
     supervisor, errors = Supervisor(controller, **{"fs": FS, "amplitude_limit": 20.0} | changed), []
     while (block := interface.read()) is not None:
