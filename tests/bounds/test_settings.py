@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.channels import dense_systems
-from helpers.settings_grid import FS, NOISES, ON, compare, made_plants, noisy_scene, silent_run
+from helpers.settings_grid import FS, NOISES, ON, compare, noisy_scene, silent_run
 
 from comparisons.bench.noises import bursty_noise
+from comparisons.studies.cases import modelled_plants
 from kfopc_filterpy import Plant, kf_anc, simulate, suggest_settings
 from kfopc_filterpy.bounds import measurement_noise_from_run, settings
 from kfopc_filterpy.signals import tone
@@ -213,14 +214,14 @@ def test_the_shortest_record_and_the_longest_filter_that_it_supports():
 )
 def test_no_setting_of_a_grid_is_better_by_half_a_decibel(path, noise):
     """`python tests/helpers/settings_grid.py` tries all cases and longer filters."""
-    found = compare(made_plants()[path], NOISES[noise], duration=2.0, lengths=(64, 128), factors=(0.01, 1.0, 100.0))
+    found = compare(modelled_plants()[path], NOISES[noise], duration=2.0, lengths=(64, 128), factors=(0.01, 1.0, 100.0))
     assert np.all(found.own > found.best - 0.5), f"{found.own} against {found.best}"
     assert np.all(found.own[0] > 5.0)  # there is something to lose
 
 
 def test_a_large_initial_variance_diverges_where_the_suggested_one_does_not():
     """The path estimate is wrong by 10 % of its energy's root: weak directions with a large variance follow the error."""
-    x, plant = noisy_scene(made_plants()["band-pass"], NOISES["band noise"], 1, 1.75)
+    x, plant = noisy_scene(modelled_plants()["band-pass"], NOISES["band noise"], 1, 1.75)
     s = plant.secondary
     wrong = np.random.default_rng(3).standard_normal(s.shape)
     estimate = s + 0.1 * np.linalg.norm(s) / np.linalg.norm(wrong) * wrong

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from comparisons.bench.noises import bursty_noise, looped, swelling
-from kfopc_filterpy import Plant, bandpass_path, kf_anc, kf_opc, simulate, suggest_settings
+from comparisons.studies.cases import modelled_plants, of_unit_gain
+from kfopc_filterpy import Plant, kf_anc, kf_opc, simulate, suggest_settings
 from kfopc_filterpy.bounds import SuggestedSettings, wiener_solution
-from kfopc_filterpy.paths import duct_plant
 from kfopc_filterpy.signals import band_limited_noise, compressor_noise, scaled_to_power, tone
 
 FS = 16000.0
@@ -61,11 +61,6 @@ NOISES: dict[str, Noise] = {
         band_noise(duration, seed), fs=FS, swing_db=6.0, period_s=4.0, phase_rad=float(seed)
     ),
 }
-
-
-def made_plants() -> dict[str, Plant]:
-    """Return the plants of the models, by name."""
-    return {"band-pass": Plant(bandpass_path(32, fs=FS), bandpass_path(128, fs=FS)), "duct": duct_plant(fs=FS)}
 
 
 def noisy_scene(plant: Plant, noise: Noise, seed: int, duration: float) -> tuple[np.ndarray, Plant]:
@@ -120,7 +115,7 @@ def main() -> None:
     """Print the table of all cases."""
     from comparisons.bench.measured import DataUnavailableError, load_measured_duct
 
-    plants, noises = made_plants(), dict(NOISES)
+    plants, noises = modelled_plants(), dict(NOISES)
     try:
         for name, apart_s in (("motor", 5.0), ("compressor", 8.0)):  # the run begins so much later in the recording
             measured = load_measured_duct(name)
@@ -128,8 +123,7 @@ def main() -> None:
             noises[f"recorded {name}"] = lambda duration, seed, recording=recording, apart_s=apart_s: looped(
                 recording, duration, fs=FS, start_s=apart_s * (seed - 1)
             )
-        scale = np.sqrt(np.sum(measured.secondary**2))  # its units are arbitrary
-        plants["measured duct"] = Plant(measured.secondary / scale, measured.primary / scale, fs=FS)
+        plants["measured duct"] = of_unit_gain(measured)
     except DataUnavailableError as error:
         print(f"without the measured duct and the recordings: {error}")
     print("dB by which the best of the grid is better: noise reduction, mean NSE")
