@@ -29,7 +29,7 @@ WAYS = {  # law, what it must know beside the secondary path, and what it keeps
     "MOV-FxLMS fixed": ("the same, g tuned", "g and mu, by trials", "what the trials kept"),
     "optimal leaky FxLMS": ("w += mu (e x' - g w), g from d^", "rated power, mu", "power, if flat and white"),
     "power-limited FxLMS": ("MOV-FxLMS in bins, g integrated", "rated power, mu", "power"),
-    "two-gradient FxLMS": ("w -= mu y x if |y| > A, else FxLMS", "A and mu, by trials", "a peak, not exactly"),
+    "two-gradient FxLMS": ("w -= mu y x if |y| > A, else FxLMS", "A and mu, by trials", "a peak, roughly"),
 }
 
 

@@ -67,14 +67,14 @@ def demo(options: argparse.Namespace) -> int:
     learned = slice(0, int(5 * FS))
     simulate(controller, signals["noise"][learned], Plant(signals["S"], fs=FS), disturbance=signals["d"][learned])
     controller.save(trained)
-    noise, _, *paths = (shlex.quote(str(path)) for path in files)
-    scene = f"{noise} --primary {paths[0]} --secondary {paths[1]}"
+    noise, d, primary_path, secondary_path = (shlex.quote(str(path)) for path in files)
+    recorded = f"{noise} --disturbance {d} --secondary {secondary_path}"
     folder, kfopc = options.folder, program()
     print(f"noise.wav, d.wav, P.wav, S.wav, controller.toml and trained.npz written into {folder}. For example:")
     for command in (
-        f"verdict {scene} --watt {WATT:g} --ohm {OHM:g} --volts-per-unit {VOLTS_PER_UNIT:g} -o "
+        f"verdict {recorded} --watt {WATT:g} --ohm {OHM:g} --volts-per-unit {VOLTS_PER_UNIT:g} -o "
         + shlex.quote(str(folder / "out")),
-        f"run {scene} --rated-power {RATED_POWER:g} --block 16",
+        f"run {noise} --primary {primary_path} --secondary {secondary_path} --rated-power {RATED_POWER:g} --block 16",
         f"export {shlex.quote(str(trained))} -o {shlex.quote(str(folder / 'firmware'))} --dtype float32",
     ):
         print(f"{kfopc} {command}")

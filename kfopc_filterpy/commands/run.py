@@ -230,7 +230,7 @@ def summarize(report: RunReport, fs: float, block: int) -> str:
     if report.round_trip_samples is not None:
         lines.append(f"round trip {report.round_trip_samples} samples, {1e3 * report.round_trip_samples / fs:.1f} ms")
     if np.isfinite(report.possible_db):
-        reach = f"the best filter without a rated power would reach {report.possible_db:.1f} dB"
+        reach = f"in the silence before, the best fixed filter without a rated power would reach {report.possible_db:.1f} dB"
         if report.possible_db < SMALL_BOUND_DB and block > 1:
             reach += (
                 f"; if the anti-noise comes too late, use a smaller --block: two blocks of {block} samples are "
