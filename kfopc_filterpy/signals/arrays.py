@@ -9,7 +9,8 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from .content import Content, chosen_variable, require_few, require_room
+from .content import Content, require_room
+from .variables import chosen_variable, require_few
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -56,7 +57,8 @@ def read_npz(path: str | os.PathLike[str], variable: str | None) -> Content:
                 return _read_array(file, _read_header(file))
 
         shapes = {name: header.shape for name, header in headers.items() if header.dtype.kind in "fiub"}
-        others = {name: str(header.dtype) for name, header in headers.items() if name not in shapes}
+        kinds = {name: header.dtype for name, header in headers.items() if name not in shapes}
+        others = {name: "text" if kind.kind in "US" else str(kind) for name, kind in kinds.items()}
         return chosen_variable(path, shapes, read, variable, others)
 
 

@@ -12,6 +12,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -53,6 +54,8 @@ def read_in_child(
             output: Any = child.stdout
             answer = json.loads(output.readline() or "{}")
             if "shape" in answer:
+                for told in answer.pop("warnings"):
+                    warnings.warn(told, stacklevel=2)
                 samples = np.empty(answer.pop("shape"))
                 if output.readinto(samples.reshape(-1).view(np.uint8)) == samples.nbytes:
                     return Content(samples, **answer)
@@ -72,9 +75,14 @@ def serve(library: str, function: tuple[str, str], arguments: list[str], limit_s
         import_module(library)  # which takes time and memory of its own
         faulthandler.dump_traceback_later(limit_s, exit=True)  # even if a library never returns
         _limit_memory(3 * room_of(arguments[0]))
-        content: Content = read(*arguments)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", UserWarning)
+            content: Content = read(*arguments)
         samples = np.ascontiguousarray(content.samples, dtype=np.float64)
-        answer: dict[str, Any] = content._asdict() | {"shape": samples.shape}
+        answer: dict[str, Any] = content._asdict() | {
+            "shape": samples.shape,
+            "warnings": [str(one.message) for one in told],
+        }
         del answer["samples"]
     except MemoryError:
         text = "would take more memory than a file of its size may. If the file is right, store it uncompressed, or in parts"

@@ -11,7 +11,8 @@ import numpy as np
 
 from .._validate import optional_module
 from .child import read_in_child
-from .content import Content, chosen_variable, require_room
+from .content import Content, require_room
+from .variables import chosen_variable
 
 NUMERIC_CLASSES = (
     "double",
@@ -53,11 +54,13 @@ def read_mat73_here(path: str | os.PathLike[str], variable: str | None) -> Conte
                 empty = "MATLAB_empty" in file[place].attrs
                 shapes[name] = (0,) if empty else file[place].shape[::-1]
             else:
-                others[name] = "complex numbers" if kind in NUMERIC_CLASSES else kind
+                others[name] = (
+                    "complex numbers" if kind in NUMERIC_CLASSES else {"char": "text", "cell": "a cell"}.get(kind, kind)
+                )
         return chosen_variable(
             path,
             shapes,
-            lambda name: _read(path, file, name.replace(".", "/")).T if shapes[name] != (0,) else np.empty(0),
+            lambda name: _read(path, file, name.replace(".", "/")).T if shapes.get(name) != (0,) else np.empty(0),
             variable,
             others,
         )

@@ -10,8 +10,9 @@ import os
 import numpy as np
 
 from .child import read_in_child
-from .content import Content, chosen_variable
+from .content import Content
 from .hdf5 import NUMERIC_CLASSES, read_mat73
+from .variables import chosen_variable
 
 
 def read_mat(path: str | os.PathLike[str], variable: str | None) -> Content:
@@ -29,7 +30,7 @@ def read_mat_here(path: str | os.PathLike[str], variable: str | None) -> Content
 
     contents = whosmat(path)
     shapes = {name: tuple(map(int, shape)) for name, shape, kind in contents if kind in NUMERIC_CLASSES}
-    others = {name: kind for name, _, kind in contents if kind not in NUMERIC_CLASSES}
+    others = {name: "text" if kind == "char" else kind for name, _, kind in contents if kind not in NUMERIC_CLASSES}
     fields: dict[str, np.ndarray] = {}
     for name in [name for name, kind in others.items() if kind == "struct" and variable not in shapes]:
         fields |= _fields(name, loadmat(path, variable_names=[name])[name])

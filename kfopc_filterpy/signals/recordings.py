@@ -368,6 +368,8 @@ def read_content(path: str | os.PathLike[str], *, channel: int | None = None, va
         content = _without_time(path, content)
     samples = channels_first(content.samples)
     if channel is not None:
+        units = (content.unit or "1").split(", ")
+        content = content._replace(unit=units[channel % len(units)])
         samples = np.atleast_2d(samples)[as_channel(channel, np.atleast_2d(samples), path)]
     require_finite(samples, f"the signal of {path}")
     return content._replace(samples=np.ascontiguousarray(samples, dtype=np.float64))

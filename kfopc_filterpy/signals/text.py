@@ -32,8 +32,11 @@ _STATED = {
     "hz": re.compile(r"\b(?:sampl\w*[ _-]*(?:rate|freq\w*)|(f_?s|sr))" + _AFTER, re.IGNORECASE),
     "s": re.compile(r"\b(?:sampl\w*[ _-]*(?:interval|period)|(dt))" + _AFTER, re.IGNORECASE),
 }
-_UNIT = re.compile(r"(?:[(\[/]\s*|^\W*)([muk\u00b5\u03bc]?)(Pa|V|Volts?|A|N|g|m/s(?:\u00b2|\^?2)?)\s*[)\]]?\W*$")
-_PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "\u00b5": 1e-6, "\u03bc": 1e-6, "n": 1e-9}
+_UNIT = re.compile(  # in brackets, after the slash of "p/Pa", or alone; "mPa/V" is of a path
+    r"(?:[(\[]\s*|^[^(\[]*?/\s*|^\W*)([muk\u00b5\u03bc]?)([Pp]ascals?|Pa|[Vv]olts?|V|A|N|g|m/s(?:\u00b2|\^?2)?)"
+    r"(?:/([muk\u00b5\u03bc]?)(Pa|V|A|N|W))?\s*[)\]]?\W*$"
+)
+PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "\u00b5": 1e-6, "\u03bc": 1e-6, "n": 1e-9}
 _FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")  # 1.0D-03
 _FIRST_NAME = re.compile(r"[^,;\t]*[,;\t]|\S+\s+")  # of a heading
 _FREQUENCY = re.compile(r"\W*(freq|hz\b|f\s*[(\[/]\s*hz)", re.IGNORECASE)
@@ -79,27 +82,36 @@ def read_text(path: str | os.PathLike[str]) -> Content:
     table = _read_table(path)
     content = without_time(path, table)
     rounding = rounding_of(table.columns[:, 0]) / (np.ptp(table.columns[:, 0]) or 1.0)
-    return content._replace(fs=agreed_rate(path, _stated_rate(path, table.header), content.fs, rounding))
+    return content._replace(fs=agreed_rate(path, stated_rate(path, table.header), content.fs, rounding))
 
 
-def _stated_rate(path: str | os.PathLike[str], header: list[str]) -> float | None:
+def stated_rate(path: str | os.PathLike[str], header: list[str]) -> float | None:
     """Return the rate in Hz that a header names, None if it names none."""
     for kind, stated in _STATED.items():
         for found in filter(None, (stated.search(line[:_LONGEST_STATEMENT]) for line in header)):
             short, before, unit_before, number, after, unit_after = found.groups()
             plain = number.replace(",", "" if re.fullmatch(r"\d+(,\d{3})+", number) else ".").rstrip(".")
-            value = float(plain) * _PREFIXES[(before or after or "").lower()]
+            value = float(plain) * PREFIXES[(before or after or "").lower()]
             unit = (unit_before or unit_after or kind).lower()
             if unit == kind and not (short and kind == "hz" and value < LEAST_SURE_RATE):  # "FS: 10 V" is full scale
                 return value if kind == "hz" else rate_of_step(value, path)
     return None
 
 
+def unit_of(heading: str) -> tuple[float, str] | None:
+    """Return the factor to a unit without prefix, and the unit, at the end of a heading: 1e-3 and "Pa" for "p (mPa)"."""
+    found = _UNIT.search(heading)
+    if found is None:
+        return None
+    unit = re.sub("^[Vv]olts?$", "V", re.sub("^[Pp]ascals?$", "Pa", found[2])) + (f"/{found[4]}" if found[4] else "")
+    return PREFIXES[found[1]] / PREFIXES[found[3] or ""], unit
+
+
 def _units(names: list[str]) -> tuple[np.ndarray, str | None]:
     """Return the factors of columns to units without prefix, and the units, by the columns' headings."""
-    found = [_UNIT.search(name) for name in names]
-    factors = np.array([_PREFIXES[one[1]] if one else 1.0 for one in found] or [1.0])
-    units = [re.sub("^Volts?$", "V", one[2]) if one else "1" for one in found]
+    found = [unit_of(name) for name in names]
+    factors = np.array([one[0] if one else 1.0 for one in found] or [1.0])
+    units = [one[1] if one else "1" for one in found]
     return factors, ", ".join(units[: 1 if len(set(units)) == 1 else None]) if any(found) else None
 
 

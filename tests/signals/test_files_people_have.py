@@ -374,8 +374,10 @@ def hdf5_struct(path, content):
             group = file.create_group(name)
             group.attrs["MATLAB_class"] = np.bytes_("struct")
             for field, value in fields.items():
+                is_text = isinstance(value, str)
+                value = np.array([*map(ord, value)], np.uint16) if is_text else value
                 data = group.create_dataset(field, data=np.atleast_2d(value).T)
-                data.attrs["MATLAB_class"] = np.bytes_("double")
+                data.attrs["MATLAB_class"] = np.bytes_("char" if is_text else "double")
         group["itself"] = group  # which only a damaged file has
     with open(path, "r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
@@ -446,6 +448,14 @@ def quiet_or_16_bits_in_the_low_24(path):
     path.write_bytes(wav(np.resize(np.int32(2**15 * signal()) * 256, FS).view(np.uint8), 24, 4))
 
 
+def variables(**beside):
+    return lambda path: scipy.io.savemat(path, {"p": SIGNAL, **beside})
+
+
+def two_units(path):
+    np.savez(path, p=np.c_[SIGNAL, SIGNAL], units=["mPa", "V"], fs=FS)
+
+
 # A file's name; its text, or what writes it; how it is asked for; its rate, unit and first samples, or the error.
 STATED = [
     ("rate.txt", "Sample Rate: 48000 Hz. Linear scale\n0.5\n1\n", {"fs": 48000}, (48000, "1", [0.5, 1])),
@@ -462,6 +472,20 @@ STATED = [
     ("other.csv", "t (s),u [V]\n" + times(".7f", 16000), {"unit": "Pa"}, "is in V, but unit = 'Pa': .* unit_per_full_scale"),
     ("twice.csv", "t (s),P (Pa)\n" + times(".7f", 16000), {"unit": "Pa", "unit_per_full_scale": 2}, "is in Pa, .* already"),
     ("both.csv", "P (Pa);u (V)\n1,5;2\n2,5;3\n0;1\n", {"fs": 8000}, (8000, "Pa, V", [[1.5, 2.5, 0], [2, 3, 1]])),
+    ("one.csv", "P (mPa);u (V)\n1,5;2\n2,5;3\n0;1\n", {"fs": 8000, "channel": 0, "unit": "Pa"}, (8000, "Pa", [1.5e-3, 2.5e-3, 0])),
+    ("path.txt", "S [mPa/mV]\n0.5\n1\n", {"fs": 8000}, (8000, "Pa/V", [0.5, 1])),
+    ("slash.txt", "S/mPa/V\n0.5\n1\n", {"fs": 8000}, (8000, "Pa/V", [5e-4, 1e-3])),
+    ("none.txt", "S (counts/V)\n0.5\n1\n", {"fs": 8000}, (8000, "1", [0.5, 1])),
+    ("unit.mat", variables(unit="mPa", fs="16 kHz"), {}, (FS, "Pa", signal()[:2] / 1e3)),
+    ("unit.mat", variables(p_units="V", units="Pa", fs="16000"), {"unit": "Pa"}, "is in V, but unit = 'Pa'"),
+    ("unit.mat", variables(unit="counts", fs_kHz=16), {}, (FS, "counts", signal()[:2])),
+    ("unit.mat", variables(unit="Pa", fs="16 kHz", dt_us=50), {}, r"several sampling rates beside 'p', \[16000.0, 20000.0\]"),
+    ("unit.mat", variables(unit="Pa", Fs="16"), {}, "a sampling rate of 16 Hz: is it in kHz"),
+    ("unit7.mat", lambda path: hdf5_struct(path, {"m": {"p": SIGNAL, "units": "mV", "fs": FS}}), {}, (FS, "V", signal()[:2] / 1e3)),
+    ("unit.npz", lambda path: np.savez(path, p=SIGNAL, unit="mPa", t_ms=1e3 * TIMES), {}, (FS, "Pa", signal()[:2] / 1e3)),
+    ("units.npz", two_units, {"channel": 1}, (FS, "V", signal()[:2])),
+    ("units.npz", two_units, {}, (FS, "Pa, V", np.array([1e-3, 1])[:, None] * signal()[:2])),
+    ("units.mat", variables(units=np.array(["Pa", "V"], object), fs=FS), {}, r"states 2 units in 'units', \['Pa', 'V'\], for 1 "),
     ("few.csv", "t,p\n" + times(".5f", 44100), {}, (44100, "1", [300, 301])),
     ("fewer.csv", "t,p\n" + times(".5f", 48000), {}, (48000, "1", [300, 301])),
     ("odd.csv", "t,p\n" + times(".5f", 44000), {}, (44000, "1", [300, 301])),
@@ -500,5 +524,9 @@ def test_what_a_file_states_is_read_or_asked_about(tmp_path, name, content, aske
 
 def test_a_rate_by_times_of_few_digits_is_said(tmp_path):
     (tmp_path / "x.csv").write_text("t,p\n" + times(".5f", 44100))
-    with pytest.warns(UserWarning, match=r"which allow 44088 Hz \+- 49 Hz: it is taken to be sampled at 44100 Hz"):
-        read_recording(tmp_path / "x.csv")
+    numbers = np.loadtxt(tmp_path / "x.csv", delimiter=",", skiprows=1)
+    scipy.io.savemat(tmp_path / "x.mat", {"a": numbers})
+    scipy.io.savemat(tmp_path / "t.mat", {"a": numbers[:, 1], "t": numbers[:, 0]})
+    for name in ("x.csv", "x.mat", "t.mat"):
+        with pytest.warns(UserWarning, match=r"which allow 44088 Hz \+- 49 Hz: it is taken to be sampled at 44100 Hz"):
+            read_recording(tmp_path / name)

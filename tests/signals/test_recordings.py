@@ -97,7 +97,7 @@ def test_a_variable_of_several_is_chosen_by_name(tmp_path):
     for name, variable, message in (
         ("x.mat", None, r"holds several variables: Fs \(1, 1\), a \(1, 2\), b \(1, 2\), z \(1, 2\); choose"),
         ("x.mat", "c", r"variable 'c' is not in .*; it holds: Fs .*, a .*, b "),
-        ("x.mat", "who", "variable 'who' of .* must hold real numbers, got char"),
+        ("x.mat", "who", "variable 'who' of .* must hold real numbers, got text"),
         ("x.mat", "z", "variable 'z' of .* must hold real numbers, got complex128"),
         ("x.npz", None, r"holds several variables: a \(2,\), b \(2,\); choose one with the option variable"),
         ("x.wav", "b", "is an audio file, which has no named variables: leave out the option variable"),
@@ -125,7 +125,7 @@ def test_matlab_7_3_has_what_matlab_would_show(tmp_path):
     for name, message in (
         ("none", r"variable 'none' of .* is empty"),
         ("z", r"variable 'z' of .* must hold real numbers, got complex numbers"),
-        ("text", r"variable 'text' of .* must hold real numbers, got char"),
+        ("text", r"variable 'text' of .* must hold real numbers, got text"),
         ("elsewhere", r"variable 'elsewhere' of .* must hold real numbers, got a link to another file"),
         ("outside", r"'outside' of .* refers to other files"),
         ("paths", r"must hold signals, .* got shape \(2, 3, 4\); read impulse responses with paths\.read_path"),

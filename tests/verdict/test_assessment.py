@@ -283,6 +283,15 @@ def test_the_watts_of_the_lead_figure_are_written_out(written):
     assert all(re.fullmatch(r"0\.0*1|10*", text) for text in shown)
 
 
+def test_figures_are_dark_where_the_page_is(written, browser):
+    for scheme, filtered in (("dark", True), ("light", False)):
+        media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+        browser.get(written[1].as_uri())
+        found = browser.execute_script("return getComputedStyle(document.querySelector('figure img')).filter")
+        assert ("invert" in found) == filtered
+
+
 def test_a_third_octave_that_the_control_makes_louder_is_noted():
     """A white reference explains a disturbance of one band; a short filter adds noise beside it."""
     x = np.random.default_rng(0).standard_normal(3 * FS)
