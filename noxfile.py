@@ -4,7 +4,7 @@
 # ///
 """Tasks: `nox -l` lists them, `nox -s docs` runs one. What follows `--` goes to pytest, Sphinx, the studies or cosmic-ray.
 
-`.ci/run` runs those marked with a star, `.ci/slow` runs bare, wheels, slow, fuzz, kernels and prove; both install nox.
+`.ci/run` runs those marked with a star, `.ci/slow` runs bare, wheels, slow, kernels and prove; both install nox.
 Sessions that leave cores idle may run beside one another (`nox -j 2`).
 """
 
@@ -206,19 +206,6 @@ def prove(session: nox.Session) -> None:
     if missing := [tool for tool in tools if shutil.which(tool) is None]:
         session.skip(f"not installed: {', '.join(missing)}")
     session.run("python3", "tests/proofs/prove.py", external=True)
-
-
-@nox.session(default=False)
-def fuzz(session: nox.Session) -> None:
-    """Fuzz the readers of files with atheris for a minute; skipped if there is no atheris for this Python."""
-    session.install(*PINNED, "-e", ".[test]")
-    try:
-        session.install("atheris>=3")
-    except nox.command.CommandFailed:
-        session.skip("atheris is not installed")
-    program = Path("tests/signals/fuzz_readers.py").resolve()
-    with session.chdir(session.create_tmp()):  # where atheris writes the input that ended the search
-        session.run("python", str(program), "-max_total_time=60", "-verbosity=0", "-print_final_stats=1")
 
 
 @nox.session(default=False)

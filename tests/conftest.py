@@ -31,7 +31,6 @@ settings.load_profile("ci")
 pytest.register_assert_rewrite("helpers")  # their assertions say what they compared, as those of the tests do
 
 ROOT = Path(__file__).resolve().parents[1]
-collect_ignore = ["signals/fuzz_readers.py"]  # a program, which needs atheris
 
 
 @pytest.fixture(scope="module")

@@ -1,33 +1,30 @@
-"""MATLAB files: versions 4 to 7.2, and which version a file has.
-
-They are read in a process of their own, see `child`.
-"""
+"""MATLAB files: versions 4 to 7.2, and which version a file has."""
 
 from __future__ import annotations
 
 import os
+import struct
+import zlib
 
 import numpy as np
 
-from .child import read_in_child
-from .content import Content
+from .content import Content, require_room, room_of
 from .hdf5 import NUMERIC_CLASSES, read_mat73
 from .variables import chosen_variable
+
+_HEAD, _COMPRESSED = 128, 15  # bytes before the parts of a file, and the mark of a compressed one
 
 
 def read_mat(path: str | os.PathLike[str], variable: str | None) -> Content:
     """Return one variable of a MATLAB file of any version."""
+    from scipy.io import loadmat, whosmat
     from scipy.io.matlab import matfile_version
 
-    if matfile_version(path)[0] == 2:
+    version = matfile_version(path)[0]
+    if version == 2:
         return read_mat73(path, variable)
-    return read_in_child("scipy.io", read_mat_here, path, variable)
-
-
-def read_mat_here(path: str | os.PathLike[str], variable: str | None) -> Content:
-    """Return one variable of a MATLAB file of version 4 to 7.2, in this process."""
-    from scipy.io import loadmat, whosmat
-
+    if version == 1:
+        _require_room_unpacked(path)
     contents = whosmat(path)
     shapes = {name: tuple(map(int, shape)) for name, shape, kind in contents if kind in NUMERIC_CLASSES}
     others = {name: "text" if kind == "char" else kind for name, _, kind in contents if kind not in NUMERIC_CLASSES}
@@ -42,6 +39,18 @@ def read_mat_here(path: str | os.PathLike[str], variable: str | None) -> Content
         return fields[name] if name in fields else loadmat(path, variable_names=[name])[name]
 
     return chosen_variable(path, shapes, read, variable, others)
+
+
+def _require_room_unpacked(path: str | os.PathLike[str]) -> None:
+    """Raise ValueError if a compressed part of a file of version 5 to 7.2 is too large: scipy unpacks it whole."""
+    with open(path, "rb") as file:
+        head = file.read(_HEAD)
+        order = "<" if head.endswith(b"IM") else ">"
+        while len(tag := file.read(8)) == 8:
+            kind, size = struct.unpack(f"{order}2I", tag)
+            part = file.read(size)
+            if kind == _COMPRESSED:
+                require_room(path, len(zlib.decompressobj().decompress(part, room_of(path) + 1)) / 8)
 
 
 def _fields(name: str, value: np.ndarray) -> dict[str, np.ndarray]:
