@@ -1,14 +1,13 @@
 """Files that are written whole: beside their place, forced to the disk, and then renamed.
 
 So the disk may be full, the process killed or a file written onto its own source: what was there before stays, or all
-of the new is there. Files that belong together change together.
+of the new is there. Files that belong together move to their places once all of them are written.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -58,47 +57,29 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             error.filename = str(path)
         raise
     if os.name != "nt":  # Windows does not open folders
-        with _opened(place.parent) as folder:
+        folder = os.open(place.parent, os.O_RDONLY)
+        try:
             os.fsync(folder)  # the new name is on the disk too
+        finally:
+            os.close(folder)
 
 
 @contextmanager
 def replacing_files(folder: Path) -> Iterator[Path]:
-    """Yield an empty folder. When the block ends, its files take the same places in `folder`, all of them or none.
+    """Yield an empty folder. When the block ends, its files take the same places in `folder`; other files there stay.
 
-    Other files of `folder` stay. A second process that writes there waits for this one, except on Windows. If the
-    process is killed among the renames, which take milliseconds, then the files at the top of `folder` are missing,
-    because they go first and come last: no page stands beside sounds of another run.
+    Those at the top of `folder` move last: a page that is there has its sounds.
     """
     _remove_abandoned(folder, "files")
     made = Path(tempfile.mkdtemp(prefix=".files.", suffix=".part", dir=folder))
     try:
-        new = made / "new"
-        new.mkdir()
-        yield new
-        with _locked(folder):
-            _exchange(new, folder, made / "old")
+        yield made
+        names = [path.relative_to(made) for path in made.rglob("*") if path.is_file()]
+        for name in sorted(names, key=lambda name: len(name.parts), reverse=True):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(made / name, folder / name)
     finally:
         shutil.rmtree(made, ignore_errors=True)
-
-
-def _exchange(new: Path, folder: Path, old: Path) -> None:
-    """Move the files of `new` to the same places in `folder`, and what they replace to `old`."""
-    names = [path.relative_to(new) for path in new.rglob("*") if not path.is_dir()]
-    names.sort(key=lambda name: (len(name.parts), name))
-    try:
-        for name in names:
-            if (folder / name).is_file():
-                _move(folder / name, old / name)
-        for name in reversed(names):
-            _move(new / name, folder / name)
-    except BaseException:
-        for name in names:
-            if (old / name).exists():
-                os.replace(old / name, folder / name)
-            elif not (new / name).exists():
-                (folder / name).unlink()
-        raise
 
 
 def made_folder(folder: str | os.PathLike[str]) -> Path:
@@ -159,36 +140,8 @@ def jsonable(value: object, where: str = "value") -> Any:
     raise TypeError(f"{where} must hold numbers, text, arrays, lists or mappings, got {type(value).__name__}")
 
 
-def _move(path: Path, to: Path) -> None:
-    to.parent.mkdir(parents=True, exist_ok=True)
-    os.replace(path, to)
-
-
 def _remove_abandoned(folder: Path, name: str) -> None:
     for left in folder.glob(f".{escape(name)}.*.part"):
         with suppress(OSError):
             if time.time() - left.stat().st_mtime > ABANDONED_S:
                 shutil.rmtree(left) if left.is_dir() else left.unlink()
-
-
-@contextmanager
-def _opened(folder: Path) -> Iterator[int]:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from changing the files of a folder; where there are no such locks, do nothing."""
-    if sys.platform == "win32":
-        yield
-        return
-    from fcntl import LOCK_EX, flock
-
-    with _opened(folder) as descriptor:
-        with suppress(OSError):  # a file system without locks
-            flock(descriptor, LOCK_EX)
-        yield

@@ -1,4 +1,4 @@
-"""Writers on a full disk, interrupted at any line, and beside each other: what was there stays, or all of the new is there."""
+"""Writers on a full disk, and interrupted: what was there stays, or all of the new is there."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.commands import FS, ROOT, SCENE
+from helpers.commands import FS
 from matplotlib.figure import Figure
 
 from comparisons.bench import Sound, StudyReport, write_report
@@ -84,110 +84,35 @@ def test_the_error_names_the_file_and_not_the_one_beside_it(tmp_path):
             write_wav(path, np.ones(3), FS)
 
 
-@contextmanager
-def interrupt_at(line: int) -> Iterator[None]:
-    """Raise KeyboardInterrupt at the n-th line of the module that writes.
+def test_files_that_belong_together_are_new_once_all_are_written_with_those_at_the_top_last(tmp_path, monkeypatch):
+    def interrupted():
+        with _writing.replacing_files(tmp_path) as new:
+            (new / "page").write_text("new")
+            raise KeyboardInterrupt
 
-    Not in the function that opens a folder: between the opening and the closing of a descriptor CPython lets no signal in.
-    """
-    lines = 0
-
-    def trace(frame, event, argument):
-        nonlocal lines
-        code = frame.f_code
-        if code.co_filename == _writing.__file__ and code.co_name != "_opened" and event == "line":
-            lines += 1
-            if lines == line:
-                sys.settrace(None)
-                raise KeyboardInterrupt
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        yield
-    finally:
-        sys.settrace(before)
+    (tmp_path / "page").write_text("old")
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert contents(tmp_path) == {"page": b"old"}
+    moved = []
+    monkeypatch.setattr(
+        _writing.os, "replace", lambda source, to, move=os.replace: moved.append(to) or move(source, to)
+    )
+    with _writing.replacing_files(tmp_path) as new:
+        (new / "audio" / "deep").mkdir(parents=True)
+        for name in ("page", "audio/deep/sound", "audio/sound"):
+            (new / name).write_text("new")
+    assert [str(to.relative_to(tmp_path)) for to in moved] == ["audio/deep/sound", "audio/sound", "page"]
+    assert contents(tmp_path) == dict.fromkeys(("page", "audio/deep/sound", "audio/sound"), b"new")
 
 
-def test_files_that_belong_together_are_all_old_or_all_new_at_whatever_line_their_writer_is_interrupted(tmp_path):
-    """Each file states the number of taps: no mixture passes."""
-    controllers = [fx_lms(taps, [1.0], step_size=0.1) for taps in (8, 9)]
-    whole = []
-    for controller in controllers:
-        export_c(controller, tmp_path / "anc.c")
-        whole.append(contents(tmp_path))
-    assert all(whole[0][name] != whole[1][name] for name in ("anc.c", "anc.h"))
-    seen, line, interrupted = [0, 0], 0, True
-    while interrupted:
-        line += 1
-        folder = tmp_path / str(line)
-        folder.mkdir()
-        export_c(controllers[0], folder / "anc.c")
-        try:
-            with interrupt_at(line):
-                export_c(controllers[1], folder / "anc.c")
-            interrupted = False
-        except KeyboardInterrupt:
-            pass
-        left = {name: content for name, content in contents(folder).items() if name[0] != "."}
-        assert left in whole, line
-        seen[whole.index(left)] += 1
-    assert min(seen) >= 1
-    assert seen[0] > 30
-
-
-WRITE = """
-import sys
-sys.path[:0] = sys.argv[1:3]
-from test_writing import report, write_report
-for _ in range(12):
-    write_report([report(sys.argv[4])], sys.argv[3])
-"""
-
-
-def test_processes_that_write_one_folder_do_not_fail_and_do_not_mix(tmp_path):
-    titles = ("old", "newer", "newest")
-    command = [sys.executable, "-c", WRITE, str(ROOT), str(ROOT / "tests"), str(tmp_path / "out")]
-    writing = [subprocess.Popen([*command, title], stderr=subprocess.PIPE, text=True) for title in titles]
-    errors = [one.communicate()[1] for one in writing]
-    assert [one.returncode for one in writing] == [0, 0, 0], errors
-    left = contents(tmp_path / "out")
-    for title in titles:
-        write_report([report(title)], tmp_path / title)
-    assert left in [contents(tmp_path / title) for title in titles]
-
-
-INTERRUPTED = """
-import signal, sys
-from kfopc_filterpy import __main__, _writing
-
-def move(*paths, left=[int(sys.argv.pop(1))], move=_writing._move):
-    move(*paths)
-    left[0] -= 1
-    if left[0] == 0:
-        signal.raise_signal(signal.SIGINT)
-
-_writing._move = move
-sys.exit(__main__.main())
-"""
-
-
-@pytest.mark.parametrize("renames", [1, 3], ids=["the old page is aside", "new files are in their places"])
-def test_an_interrupted_verdict_leaves_the_folder_as_it_was(renames, tmp_path):
-    noise = np.random.default_rng(0).standard_normal(5 * FS // 2)
-    for name, samples in {"noise": noise, "P": np.eye(64)[26], "S": np.eye(64)[12]}.items():
-        write_wav(tmp_path / f"{name}.wav", samples, FS)
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "verdict.html").write_text("an older page")
-    before = contents(tmp_path)
-    command = [sys.executable, "-c", INTERRUPTED, str(renames)]
-    command += ["verdict", *SCENE, "--rated-power", "4", "--taps", "16", "-o", "out", "--quiet"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert done.returncode == 130, done
-    assert done.stderr.endswith("kfopc: interrupted; each file is as it was, or was written whole\n")
-    assert contents(tmp_path) == before
+def test_what_a_killed_process_left_is_removed_after_an_hour(tmp_path):
+    left = [tmp_path / f".x.wav.{name}.part" for name in ("old", "own")]
+    for path in left:
+        path.write_text("")
+    os.utime(left[0], (0, 0))
+    write_wav(tmp_path / "x.wav", np.ones(3), FS)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [left[1].name, "x.wav"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")

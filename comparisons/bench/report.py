@@ -29,7 +29,7 @@ def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str])
     studies : sequence of StudyReport
         The studies, in their order.
     folder : path
-        Where to write; files of the same names are replaced, all of them or none, and others stay.
+        Where to write; files of the same names are replaced once all are written, and others stay.
 
     Returns
     -------

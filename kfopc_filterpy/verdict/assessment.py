@@ -321,7 +321,7 @@ class Assessment:
         """Write verdict.html, verdict.json, figures and sounds into a `folder`, and return the path of the page.
 
         The page needs no other file. All sounds have one scale: what is louder in a file is louder at the microphone.
-        Files of the same names are replaced, all of them or none, and others stay.
+        Files of the same names are replaced once all are written, and others stay.
 
         Raises
         ------
