@@ -72,7 +72,7 @@ def test_every_python_that_is_started_ignores_the_current_folder():
         for path in sorted((ROOT / folder).rglob("*.py"))
         for option in re.findall(r"sys\.executable,\s*([^,]*)", path.read_text(encoding="utf-8"))
     ]
-    assert len(started) >= 3
+    assert started
     assert [one for one in started if one[1] != '"-P"'] == []
 
 
