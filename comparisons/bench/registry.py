@@ -13,7 +13,7 @@ import numpy as np
 from kfopc_filterpy import OutputPowerConstraint
 from kfopc_filterpy.controllers import Controller, penalty_factor
 from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
-from kfopc_filterpy.controllers.table import CORE, MAKERS
+from kfopc_filterpy.controllers.table import MAKERS
 from kfopc_filterpy.power.amplifiers import Amplifier
 from kfopc_filterpy.verdict.candidates import DIAGONAL_STATE_NOISES, FORGOTTEN, STEP_SIZES
 
@@ -49,16 +49,12 @@ class Algorithm:
         The first setting as a formula, without units.
     first : tuple of float
         Values of the first setting that are tried.
-    second_kind : str, default ""
-        The second setting as a formula, "" if there is none.
     second : tuple of float, default ()
         Values of the second setting that are tried.
     of_paper : bool, default False
         Whether the paper compares it.
     keeps_budget : bool, default True
         Whether it is meant to keep the rated power.
-    sees_budget : bool, default True
-        Whether it is made with the rated power. If not, its runs serve for all rated powers.
     shares_gains : bool, default False
         Whether its gain depends on the reference alone, so that several runs on one noise share it.
     knows_amplifier : bool, default False
@@ -67,10 +63,6 @@ class Algorithm:
         Whether it may stop during a run because it cannot continue, which counts as divergence.
     several_channels : bool, default False
         Whether the studies of several channels compare it; those of one channel compare all.
-    in_core : bool, default True
-        Whether it is in the compiled core, which can be exported.
-    what : str, default ""
-        What it is, in a few words.
     """
 
     make: Callable[..., Controller]
@@ -78,17 +70,18 @@ class Algorithm:
     symbol: str
     kind: str
     first: tuple[float, ...]
-    second_kind: str = ""
     second: tuple[float, ...] = ()
     of_paper: bool = False
     keeps_budget: bool = True
-    sees_budget: bool = True
     shares_gains: bool = False
     knows_amplifier: bool = False
     may_refuse: bool = False
     several_channels: bool = False
-    in_core: bool = True
-    what: str = ""
+
+    @property
+    def sees_budget(self) -> bool:
+        """Whether it is made with the rated power, not tuned to it by a second setting; else its runs serve for all."""
+        return self.keeps_budget and not self.second
 
     @property
     def grid(self) -> list[Setting]:
@@ -196,181 +189,86 @@ def _constrained(settings: Settings) -> Settings:
     return constrained
 
 
-_RANDOM_WALK: dict[str, Any] = {
-    "symbol": "r",
-    "kind": "r E[x'^2]/q",
-    "first": STATE_NOISE_GRID,
-    "knows_amplifier": True,
+ABOUT = {
+    "KF-ANC": "a Kalman filter that learns the control filter and knows no rated power",
+    "KF-OPC": "KF-ANC with the disturbance scaled by a constraint factor, which is meant to keep the rated power",
+    "KF-PB": "a Kalman filter that learns the paths, keeps the rated power, and spends it where it reduces the noise most",
+    "diagonal KF": "KF-ANC that leaves out how the weights' errors depend on each other; it computes and learns less",
+    "diagonal KF-OPC": "the diagonal KF with KF-OPC's constraint factor",
+    "FxRLS": "recursive least squares with exponential forgetting; it knows no rated power",
+    "FxLMS": "the usual gradient descent on the squared error; it knows no rated power",
+    "FxNLMS": "FxLMS with a step size relative to the power of the filtered reference",
+    "leaky FxLMS": "FxLMS whose weights decay all the time, by a leak that was tuned to the rated power",
+    "optimal leaky FxLMS": "leaky FxLMS that computes its leak from the rated power as it runs",
+    "MOV-FxLMS fixed": "MOV-FxLMS with a fixed penalty that was tuned to the rated power",
+    "MOV-FxLMS by variance": "MOV-FxLMS with a fixed penalty, from the variance of the whole disturbance",
+    "MOV-FxLMS": "FxLMS with a penalty on the output power, computed from the rated power as it runs",
+    "MOV-MFxLMS": "MOV-FxLMS without the delay of the secondary path in its loop",
+    "two-gradient FxLMS": "FxLMS that descends on the output power instead while a sample is beyond an amplitude limit",
+    "re-scaling FxLMS": "FxLMS that scales its weights down when a sample is beyond an amplitude limit",
+    "clipping FxLMS": "FxLMS whose control signal is clipped at an amplitude limit",
+    "frequency-domain FxLMS": "FxLMS that adapts once per block, each frequency at its own rate; it knows no rated power",
+    "power-limited FxLMS": "frequency-domain FxLMS with a price on the output power that follows the measured power",
 }
-_DIAGONAL = _RANDOM_WALK | {"first": DIAGONAL_STATE_NOISES}
-_STEP: dict[str, Any] = {"symbol": "mu", "kind": "mu L E[x'^2]", "first": STEP_SIZES[::-1]}
-_LEAST_FORGOTTEN: dict[str, Any] = {"symbol": "1 - lambda", "kind": "1 - lambda", "first": FORGOTTEN}
-_LEAK = _STEP | {"second_kind": "leak over E[x'^2]", "second": PRICE_GRID, "sees_budget": False}
-_PENALTY = _STEP | {"second_kind": "penalty factor over G_s", "second": PRICE_GRID, "sees_budget": False}
-_PEAK = _STEP | {"second_kind": "A^2 over the unconstrained power", "second": PEAK_GRID, "sees_budget": False}
-_BUDGET: dict[str, Any] = {
-    "symbol": "averaging_s",
-    "kind": "averaging time in s",
-    "first": (DEFAULT_AVERAGING_S,),
-    "knows_amplifier": True,
-}
-_BLOCKS: dict[str, Any] = {
-    "symbol": "mu of a block",
-    "kind": "mu of a block",
-    "first": BLOCK_STEP_GRID,
-}
-_FREE: dict[str, Any] = {"keeps_budget": False, "sees_budget": False}
-_KNOWS: dict[str, Any] = {"knows_amplifier": True}
-_CHANNELS: dict[str, Any] = {"several_channels": True}
+OF_PAPER = ("KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS")
+WITHOUT_BUDGET = ("KF-ANC", "diagonal KF", "FxRLS", "FxLMS", "FxNLMS", "frequency-domain FxLMS")
+KNOW_AN_AMPLIFIER = (
+    *("KF-ANC", "KF-OPC", "KF-PB", "diagonal KF", "diagonal KF-OPC", "FxRLS"),
+    *("optimal leaky FxLMS", "MOV-FxLMS fixed", "MOV-FxLMS by variance", "MOV-FxLMS", "MOV-MFxLMS"),
+)
+ONE_CHANNEL = (
+    *("diagonal KF", "diagonal KF-OPC", "FxRLS"),
+    *("MOV-FxLMS by variance", "frequency-domain FxLMS", "power-limited FxLMS"),
+)
+
+Tried = tuple[str, str, tuple[float, ...], tuple[float, ...]]  # symbol and kind of the first setting, and both grids
+_RANDOM_WALK: Tried = ("r", "r E[x'^2]/q", STATE_NOISE_GRID, ())
+_DIAGONAL: Tried = ("r", "r E[x'^2]/q", DIAGONAL_STATE_NOISES, ())
+_BUDGET: Tried = ("averaging_s", "averaging time in s", (DEFAULT_AVERAGING_S,), ())
+_LEAST_FORGOTTEN: Tried = ("1 - lambda", "1 - lambda", FORGOTTEN, ())
+_STEP: Tried = ("mu", "mu L E[x'^2]", STEP_SIZES[::-1], ())
+_STEP_AND_PRICE: Tried = (*_STEP[:3], PRICE_GRID)  # leak over E[x'^2], or penalty factor over G_s
+_STEP_AND_PEAK: Tried = (*_STEP[:3], PEAK_GRID)  # A^2 over the unconstrained power
+_BLOCKS: Tried = ("mu of a block", "mu of a block", BLOCK_STEP_GRID, ())
 
 
-def _made_by(name: str, what: str, settings: Settings, **about: Any) -> Algorithm:
-    """Return an entry of an algorithm of the package."""
-    return Algorithm(MAKERS[name], settings, in_core=name in CORE, what=what, **about)
+def _entry(name: str, settings: Settings, tried: Tried, make: Callable[..., Controller] | None = None) -> Algorithm:
+    """Return the entry of an algorithm, by default of the package's of this name."""
+    return Algorithm(
+        MAKERS[name] if make is None else make,
+        settings,
+        *tried,
+        of_paper=name in OF_PAPER,
+        keeps_budget=name not in WITHOUT_BUDGET,
+        shares_gains=name in ("KF-ANC", "KF-OPC"),
+        knows_amplifier=name in KNOW_AN_AMPLIFIER,
+        may_refuse=name == "FxRLS",
+        several_channels=name not in ONE_CHANNEL,
+    )
 
 
-REGISTRY: dict[str, Algorithm] = {
-    "KF-ANC": _made_by(
-        "KF-ANC",
-        "a Kalman filter that learns the control filter and knows no rated power",
-        _random_walk,
-        of_paper=True,
-        shares_gains=True,
-        **_RANDOM_WALK,
-        **_FREE,
-        **_CHANNELS,
-    ),
-    "KF-OPC": _made_by(
-        "KF-OPC",
-        "KF-ANC with the disturbance scaled by a constraint factor, which is meant to keep the rated power",
-        _constrained(_random_walk),
-        of_paper=True,
-        shares_gains=True,
-        **_RANDOM_WALK,
-        **_CHANNELS,
-    ),
-    "KF-PB": _made_by(
-        "KF-PB",
-        "a Kalman filter that learns the paths, keeps the rated power, and spends it where it reduces the noise most",
-        _power_budget,
-        **_BUDGET,
-        **_CHANNELS,
-    ),
-    "diagonal KF": _made_by(
-        "diagonal KF",
-        "KF-ANC that leaves out how the weights' errors depend on each other; it computes and learns less",
-        _random_walk,
-        **_DIAGONAL,
-        **_FREE,
-    ),
-    "diagonal KF-OPC": _made_by(
-        "diagonal KF", "the diagonal KF with KF-OPC's constraint factor", _constrained(_random_walk), **_DIAGONAL
-    ),
-    "FxRLS": _made_by(
-        "FxRLS",
-        "recursive least squares with exponential forgetting; it knows no rated power",
-        _forgetting,
-        may_refuse=True,
-        **_LEAST_FORGOTTEN,
-        **_FREE,
-        **_KNOWS,
-    ),
-    "FxLMS": _made_by(
-        "FxLMS",
-        "the usual gradient descent on the squared error; it knows no rated power",
-        _step,
-        of_paper=True,
-        **_STEP,
-        **_FREE,
-        **_CHANNELS,
-    ),
-    "FxNLMS": _made_by(
-        "FxNLMS",
-        "FxLMS with a step size relative to the power of the filtered reference",
-        _normalised,
-        **_STEP,
-        **_FREE,
-        **_CHANNELS,
-    ),
-    "leaky FxLMS": _made_by(
-        "leaky FxLMS",
-        "FxLMS whose weights decay all the time, by a leak that was tuned to the rated power",
-        _leak,
-        **_LEAK,
-        **_CHANNELS,
-    ),
-    "optimal leaky FxLMS": _made_by(
-        "optimal leaky FxLMS",
-        "leaky FxLMS that computes its leak from the rated power as it runs",
-        _constrained(_step),
-        **_STEP,
-        **_KNOWS,
-        **_CHANNELS,
-    ),
-    "MOV-FxLMS fixed": _made_by(
-        "MOV-FxLMS",
-        "MOV-FxLMS with a fixed penalty that was tuned to the rated power",
-        _penalty,
-        **_PENALTY,
-        **_KNOWS,
-        **_CHANNELS,
-    ),
-    "MOV-FxLMS by variance": _made_by(
-        "MOV-FxLMS",
-        "MOV-FxLMS with a fixed penalty, from the variance of the whole disturbance",
-        _penalty_by_variance,
-        **_STEP,
-        **_KNOWS,
-    ),
-    "MOV-FxLMS": _made_by(
-        "MOV-FxLMS",
-        "FxLMS with a penalty on the output power, computed from the rated power as it runs",
-        _constrained(_step),
-        of_paper=True,
-        **_STEP,
-        **_KNOWS,
-        **_CHANNELS,
-    ),
-    "MOV-MFxLMS": _made_by(
-        "MOV-MFxLMS",
-        "MOV-FxLMS without the delay of the secondary path in its loop",
-        _constrained(_step),
-        **_STEP,
-        **_KNOWS,
-        **_CHANNELS,
-    ),
-    "two-gradient FxLMS": _made_by(
-        "two-gradient FxLMS",
-        "FxLMS that descends on the output power instead while a sample is beyond an amplitude limit",
-        _two_gradients,
-        **_PEAK,
-        **_CHANNELS,
-    ),
-    "re-scaling FxLMS": _made_by(
-        "re-scaling FxLMS",
-        "FxLMS that scales its weights down when a sample is beyond an amplitude limit",
-        _peak,
-        **_PEAK,
-        **_CHANNELS,
-    ),
-    "clipping FxLMS": _made_by(
-        "clipping FxLMS", "FxLMS whose control signal is clipped at an amplitude limit", _peak, **_PEAK, **_CHANNELS
-    ),
-    "frequency-domain FxLMS": _made_by(
-        "frequency-domain FxLMS",
-        "FxLMS that adapts once per block, each frequency at its own rate; it knows no rated power",
-        _in_blocks,
-        **_BLOCKS,
-        **_FREE,
-    ),
-    "power-limited FxLMS": Algorithm(
-        PowerLimitedFxLMS,
-        _within_power,
-        in_core=False,
-        what="frequency-domain FxLMS with a price on the output power that follows the measured power",
-        **_BLOCKS,
-    ),
+_MADE: dict[str, tuple[Any, ...]] = {  # settings, what is tried, and the maker of another name
+    "KF-ANC": (_random_walk, _RANDOM_WALK),
+    "KF-OPC": (_constrained(_random_walk), _RANDOM_WALK),
+    "KF-PB": (_power_budget, _BUDGET),
+    "diagonal KF": (_random_walk, _DIAGONAL),
+    "diagonal KF-OPC": (_constrained(_random_walk), _DIAGONAL, MAKERS["diagonal KF"]),
+    "FxRLS": (_forgetting, _LEAST_FORGOTTEN),
+    "FxLMS": (_step, _STEP),
+    "FxNLMS": (_normalised, _STEP),
+    "leaky FxLMS": (_leak, _STEP_AND_PRICE),
+    "optimal leaky FxLMS": (_constrained(_step), _STEP),
+    "MOV-FxLMS fixed": (_penalty, _STEP_AND_PRICE, MAKERS["MOV-FxLMS"]),
+    "MOV-FxLMS by variance": (_penalty_by_variance, _STEP, MAKERS["MOV-FxLMS"]),
+    "MOV-FxLMS": (_constrained(_step), _STEP),
+    "MOV-MFxLMS": (_constrained(_step), _STEP),
+    "two-gradient FxLMS": (_two_gradients, _STEP_AND_PEAK),
+    "re-scaling FxLMS": (_peak, _STEP_AND_PEAK),
+    "clipping FxLMS": (_peak, _STEP_AND_PEAK),
+    "frequency-domain FxLMS": (_in_blocks, _BLOCKS),
+    "power-limited FxLMS": (_within_power, _BLOCKS, PowerLimitedFxLMS),
 }
+REGISTRY = {name: _entry(name, *own) for name, own in _MADE.items()}
 
 
 def algorithms(*, several_channels: bool = False) -> Mapping[str, Algorithm]:

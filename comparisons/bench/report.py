@@ -14,7 +14,7 @@ from kfopc_filterpy.verdict.items import write_files
 from kfopc_filterpy.verdict.page import images, players, rendered
 
 from .merit import MERITS
-from .registry import REGISTRY
+from .registry import ABOUT
 from .study_report import Claim, StudyReport, claims_sentence, require_different
 
 SCREEN_ROWS = 30  # of a table that fits a screen
@@ -82,7 +82,7 @@ def _page(studies: Sequence[StudyReport], folder: Path) -> str:
         for study in studies
     ]
     names = dict.fromkeys(name for study in studies for name in study.algorithms)
-    described = {name: REGISTRY[name].what for name in names if name in REGISTRY}
+    described = {name: ABOUT[name] for name in names if name in ABOUT}
     return rendered(TEMPLATE, parts=parts, claims=claims_sentence(studies), described=described, merits=MERITS)
 
 

@@ -129,7 +129,7 @@ def _duct(fs: float) -> Plant:
 
 
 def _room(fs: float, *, loudspeakers: int) -> Plant:
-    return built_in_room(loudspeakers).plant
+    return built_in_room(loudspeakers)
 
 
 def _band(duration_s: float, *, fs: float, band_hz: list[float], rng: int) -> np.ndarray:

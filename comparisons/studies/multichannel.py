@@ -22,7 +22,7 @@ from .rows import column, figure_table, select
 DURATION_S, RECORDED_S = 8.0, 20.0  # a recording lasts for twice KF-PB's averaging time
 DIRECT = ("KF-ANC", "KF-OPC")  # their state consists of all weights
 MOST_WEIGHTS = 256  # limit for them: a sample takes K J^2 L^2 operations
-SHOWN = ("4 x 4", "band noise")  # shown over time and in the map
+SHOWN = ("4 x 4", "band noise")  # shown over time
 NSE_WINDOW_S = 0.25  # of the figure
 
 Results = dict[str, SimulationResult]
@@ -69,11 +69,7 @@ def main(runs: Runs) -> StudyReport:
         tuned[f"{place.name}, {noise}"] = best
         if (place.name, noise) == SHOWN:
             heard = [KF_PB, "FxLMS", *(row.algorithm for row in rivals(own)[:2])]
-            mapped = {name: results[name] for name in (heard[0], heard[2])}
-            figures = [
-                _course_figure(own, {name: results[name] for name in heard}),
-                rooms.map_figure(place.plant.n_loudspeakers, noise, scene, mapped),
-            ]
+            figures = [_course_figure(own, {name: results[name] for name in heard})]
             off = Sound("off", "First microphone, control off", results[KF_PB].disturbance[0], group="room")
             errors = [(f"First microphone, {name}", results[name].error[0]) for name in heard]
             sounds = [off, *(Sound(f"run-{k}", *error, group="room") for k, error in enumerate(errors))]

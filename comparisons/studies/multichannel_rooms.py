@@ -1,26 +1,24 @@
-"""Rooms of several loudspeakers and microphones for the multichannel study, their noises, scenes and level maps."""
+"""Rooms of several loudspeakers and microphones for the multichannel study, their noises and scenes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any
 
 import numpy as np
 import pyroomacoustics as pra
-from scipy.signal import fftconvolve
+from numpy.typing import ArrayLike
 
-from kfopc_filterpy import Plant, SimulationResult, signals
+from kfopc_filterpy import Plant, signals
 
-from ..bench import FigureItem, Scene
+from ..bench import Scene
 from ..bench.noises import looped
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of, measured_room, recordings, unit_scene
-from .report_parts import new_figure
 
 FS = 4000.0  # of the built-in room: ample for a band up to 500 Hz, with a quarter of the samples of 16 kHz
 N_TAPS, N_PATH_TAPS = 128, 256
-SIZE_M, HEIGHT_M, REVERBERATION_S = (6.0, 4.0, 2.6), 1.2, 0.25
+SIZE_M, REVERBERATION_S = (6.0, 4.0, 2.6), 0.25
 SPEED_OF_SOUND = 343.0  # in m/s
 HALF_WIDTH = 10  # samples on each side of an arrival: the response is then flat within 0.2 dB up to 0.4 fs
 REACH_M = (N_PATH_TAPS + HALF_WIDTH) / FS * SPEED_OF_SOUND  # from which sound arrives within the taps
@@ -34,7 +32,6 @@ RECORDINGS = ("recorded compressor", "recorded motor")
 FLOOR_DB = -60.0  # white noise below tones and band noise
 SEED = 1
 RATED_SHARE = 0.25  # rated power of each loudspeaker over the power that it would use without a limit
-MAP_SPACING_M = 0.125
 
 
 @dataclass(frozen=True)
@@ -47,31 +44,20 @@ class Place:
     noises: dict[str, Callable[[float], np.ndarray]]  # functions of a duration in s
 
 
-@dataclass(frozen=True)
-class Room:
-    """Positions (n, 3) in m in the built-in room, and the plant between them."""
-
-    sources_m: np.ndarray
-    loudspeakers_m: np.ndarray
-    microphones_m: np.ndarray
-    plant: Plant
-
-
-def built_in_room(size: int) -> Room:
+def built_in_room(size: int) -> Plant:
     """Return the built-in room, with `size` loudspeakers and as many microphones.
 
     Between the noise source and the far wall, the loudspeakers stand in a row across the room, and the microphones in
     another row 1.2 m behind it.
     """
     to_and_fro = 0.15 * (-1.0) ** np.arange(size)
-    source = np.array([SOURCE_M])
     loudspeakers = np.stack([3.2 + to_and_fro, np.linspace(0.6, 3.4, size), np.full(size, 1.1)], axis=1)
-    microphones = np.stack([4.4 - to_and_fro, np.linspace(0.9, 3.1, size), np.full(size, HEIGHT_M)], axis=1)
-    secondary, primary = (paths_between(emitters, microphones) for emitters in (loudspeakers, source))
-    return Room(source, loudspeakers, microphones, Plant(secondary, primary, fs=FS))
+    microphones = np.stack([4.4 - to_and_fro, np.linspace(0.9, 3.1, size), np.full(size, 1.2)], axis=1)
+    secondary, primary = (paths_between(emitters, microphones) for emitters in (loudspeakers, [SOURCE_M]))
+    return Plant(secondary, primary, fs=FS)
 
 
-def paths_between(emitters_m: np.ndarray, microphones_m: np.ndarray) -> np.ndarray:
+def paths_between(emitters_m: Iterable[ArrayLike], microphones_m: np.ndarray) -> np.ndarray:
     """Return the impulse responses of the built-in room, (microphones, emitters, taps), from its image sources.
 
     An image at a distance r adds its gain over 4 pi r at the time r/c. pyroomacoustics' own responses are not used: they
@@ -111,7 +97,7 @@ def places() -> dict[str, Place]:
     made: dict[str, Place] = {}
     for size in SIZES:
         name = f"{size} x {size}"
-        made[name] = Place(name, N_TAPS, built_in_room(size).plant, _noises(FS, BAND_HZ))
+        made[name] = Place(name, N_TAPS, built_in_room(size), _noises(FS, BAND_HZ))
     measured = _measured_place()
     return made | ({} if measured is None else {MEASURED: measured})
 
@@ -163,64 +149,3 @@ def make_rated_scene(place: Place, noise: str, duration_s: float) -> Scene:
 def equally_rated(scene: Scene) -> Scene:
     """Return a scene in which every loudspeaker has the mean of their rated powers."""
     return replace(scene, rated_power=np.full_like(scene.rated_power, np.mean(scene.rated_power)))
-
-
-def level_map_db(size: int, reference: np.ndarray, result: SimulationResult | None) -> tuple[np.ndarray, Any]:
-    """Return the sound level in a plane of a built-in room over the last second, and the axes of the plane in m.
-
-    The level is in dB relative to the mean over the plane without control.
-
-    Parameters
-    ----------
-    size : int
-        Number of loudspeakers of the room.
-    reference : ndarray, shape (1, n_samples)
-        Signal of the noise source, as long as the control signal.
-    result : SimulationResult or None
-        The run whose control signal the loudspeakers play; None for silence.
-    """
-    plane = _plane()
-    primary, secondary = _paths_to_plane(size)
-    needed = slice(-int(FS) - N_PATH_TAPS + 1, None)
-    sound = fftconvolve(reference[np.newaxis, :, needed], primary, mode="valid", axes=-1).sum(axis=1)
-    without = np.mean(sound**2)
-    if result is not None:
-        y = result.control_signal[np.newaxis, :, needed]
-        sound = sound - fftconvolve(y, secondary, mode="valid", axes=-1).sum(axis=1)
-    level = 10 * np.log10(np.mean(sound**2, axis=1) / without)
-    return level.reshape(plane.shape[:2]), (plane[0, :, 0], plane[:, 0, 1])
-
-
-def map_figure(size: int, noise: str, scene: Scene, results: Mapping[str, SimulationResult]) -> FigureItem:
-    """Return a figure of the sound level in a plane of a built-in room without control, and in some runs."""
-    panels: dict[str, SimulationResult | None] = {"Without control": None, **results}
-    room = built_in_room(size)
-    figure, axes = new_figure((4.1 * len(panels), 3.4), 1, len(panels), grid="", sharey=True)
-    for (name, result), ax in zip(panels.items(), axes[0], strict=True):
-        level, (x, y) = level_map_db(size, scene.settled[0], result)
-        mesh = ax.pcolormesh(x, y, level, cmap="viridis", vmin=-15.0, vmax=10.0, shading="nearest", rasterized=True)
-        for points, mark in ((room.sources_m, "*"), (room.loudspeakers_m, "s"), (room.microphones_m, "o")):
-            ax.plot(*points[:, :2].T, mark, color="white", markeredgecolor="black", markersize=7)
-        ax.set_title(name, fontsize="medium")
-        ax.set(xlabel="x (m)", aspect="equal")
-    axes[0, 0].set_ylabel("y (m)")
-    figure.colorbar(mesh, ax=axes[0].tolist(), label="Level (dB)", shrink=0.8)
-    caption = (
-        f"Built-in room, {size} x {size}, {noise}: sound level over the last second in a plane {HEIGHT_M:g} m above the "
-        "floor, in dB relative to the mean without control. Star: noise source; squares: loudspeakers; circles: error "
-        "microphones."
-    )
-    return FigureItem("map", caption, figure)
-
-
-def _plane() -> np.ndarray:
-    """Return the points of the level map, (n_y, n_x, 3) in m."""
-    x, y = (np.arange(0.5, side / MAP_SPACING_M) * MAP_SPACING_M for side in SIZE_M[:2])
-    return np.stack([*np.meshgrid(x, y), np.full((y.size, x.size), HEIGHT_M)], axis=-1)
-
-
-@cache
-def _paths_to_plane(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the paths from the noise source and from the loudspeakers to the points of the level map."""
-    room, points = built_in_room(size), _plane().reshape(-1, 3)
-    return paths_between(room.sources_m, points), paths_between(room.loudspeakers_m, points)

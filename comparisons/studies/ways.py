@@ -74,7 +74,7 @@ def _improved() -> dict[str, Algorithm]:
         return {"step_size": mu, "rated_power": scene.rated_power, "primary": [0.0] * N_PRIMARY}
 
     steps = REGISTRY["MOV-FxLMS"].first
-    return {IMPROVED: Algorithm(ImprovedMOV, settings, "mu", "mu L E[x'^2]", steps, in_core=False)}
+    return {IMPROVED: Algorithm(ImprovedMOV, settings, "mu", "mu L E[x'^2]", steps)}
 
 
 def _table(scenes: dict[float, Scene], tuned: dict[float, dict[str, Tuned]]) -> Table:

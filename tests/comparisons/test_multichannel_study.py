@@ -13,7 +13,7 @@ from helpers.studies import few_settings, plain_run, run_study, smaller
 from comparisons.studies import multichannel
 from comparisons.studies import multichannel_rooms as rooms
 from comparisons.studies.multichannel import BOUND, KF_PB, SCALED, ChannelRow, claims
-from comparisons.studies.multichannel_rooms import MEASURED, Place, level_map_db
+from comparisons.studies.multichannel_rooms import MEASURED, Place
 from kfopc_filterpy import Plant
 
 KEPT = ("KF-PB", "FxLMS", "MOV-FxLMS", "clipping FxLMS", "leaky FxLMS")
@@ -22,7 +22,7 @@ KEPT = ("KF-PB", "FxLMS", "MOV-FxLMS", "clipping FxLMS", "leaky FxLMS")
 @pytest.fixture(scope="module")
 def small() -> Any:
     """The 2 x 2 room of 16 taps and two noises of two seconds, five algorithms and few settings."""
-    room = rooms.built_in_room(2).plant
+    room = rooms.built_in_room(2)
     with smaller(rooms, SIZES=(2,)):
         noises = rooms.places()["2 x 2"].noises
         rooms.places.cache_clear()
@@ -30,7 +30,7 @@ def small() -> Any:
     short = Plant(room.secondary[..., :60], room.primary[..., :100], fs=room.fs)
     place = Place("2 x 2", 16, short, chosen)
     constants = {"places": lambda: {"2 x 2": place}, "DURATION_S": 2.0, "SHOWN": ("2 x 2", "band noise")}
-    with few_settings(several_channels=KEPT), smaller(multichannel, **constants), smaller(rooms, MAP_SPACING_M=1.0):
+    with few_settings(several_channels=KEPT), smaller(multichannel, **constants):
         return run_study(multichannel), place
 
 
@@ -46,24 +46,6 @@ def test_rows_are_what_a_run_by_hand_gives(small: Any) -> None:
         result = plain_run(scene, name, row["setting"])
         assert row["noise_reduction_db"] == pytest.approx(result.noise_reduction_db, abs=1e-6)
         np.testing.assert_allclose(row["powers"], result.output_power / scene.rated_power, rtol=1e-6)
-
-
-def test_level_map_is_the_sound_at_its_points() -> None:
-    """Against paths to one point of the plane, computed and convolved on their own."""
-    with smaller(rooms, MAP_SPACING_M=1.0):  # as above: the paths to the plane are kept
-        rng = np.random.default_rng(0)
-        x = rng.standard_normal((1, int(rooms.FS) + 600))
-        y = 0.3 * rng.standard_normal((2, x.shape[1]))
-        result: Any = type("Run", (), {"control_signal": y})
-        before, (along, across) = level_map_db(2, x, None)
-        after, _ = level_map_db(2, x, result)
-    room, point = rooms.built_in_room(2), np.array([[along[4], across[1], rooms.HEIGHT_M]])
-    n = int(rooms.FS)
-    quiet = through(rooms.paths_between(room.sources_m, point), x)[0]
-    played = quiet - through(rooms.paths_between(room.loudspeakers_m, point), y)[0]
-    levels = [10 * np.log10(np.mean(sound[-n:] ** 2)) for sound in (quiet, played)]
-    assert after[1, 4] - before[1, 4] == pytest.approx(levels[1] - levels[0], abs=1e-9)
-    assert 10 * np.log10(np.mean(10 ** (before / 10))) == pytest.approx(0.0, abs=1e-9)
 
 
 # ---- Claims

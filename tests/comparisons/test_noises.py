@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from helpers.studies import smaller
 
+from comparisons.bench import noises
 from comparisons.bench.noises import bursty_noise, level_jump, looped, swelling
-from kfopc_filterpy.signals import band_limited_noise, scaled_to_power, tone
+from kfopc_filterpy.signals import band_limited_noise, tone
 
 FS = 1000.0
 EXACT = 1e-12  # rounding of a sum of 1e6 squares is far below it
@@ -19,10 +19,11 @@ WIDE = (50.0, 450.0)  # of 500 Hz: the band's own ringing is a few samples
 # ---- Bursts
 
 
-def bursts(duration_s: float = 1000.0, **options: Any) -> np.ndarray:
+def bursts(duration_s: float = 1000.0, **constants: Any) -> np.ndarray:
     """Return bursts of one level over almost no background."""
-    quiet = {"rate_hz": 2.0, "band": WIDE, "level_spread_db": 0.0, "background_db": -90.0, "decay_s": 0.02}
-    return bursty_noise(duration_s, fs=FS, rng=5, **quiet | options)
+    quiet = {"BURSTS_HZ": 2.0, "BURST_BAND_HZ": WIDE, "LEVEL_SPREAD_DB": 0.0, "BACKGROUND_DB": -90.0, "DECAY_S": 0.02}
+    with smaller(noises, **quiet | constants):
+        return bursty_noise(duration_s, fs=FS, rng=5)
 
 
 def edges(x: np.ndarray, threshold: float, hold: int = 15) -> tuple[np.ndarray, np.ndarray]:
@@ -32,18 +33,11 @@ def edges(x: np.ndarray, threshold: float, hold: int = 15) -> tuple[np.ndarray, 
     return loud[np.concatenate([[0], gaps + 1])], loud[np.concatenate([gaps, [loud.size - 1]])]
 
 
-@pytest.mark.parametrize("band", [(100.0, 1500.0), (0.0, 8000.0)], ids=["band", "all"])
-def test_bursts_have_their_power_exactly(band: tuple[float, float]) -> None:
-    x = bursty_noise(3.0, band=band, fs=16000.0, rng=2, power=40.0)
-    assert (x.shape, x.dtype) == ((48000,), np.float64)
-    assert np.mean(x**2) == pytest.approx(40.0, rel=EXACT)
-
-
-@pytest.mark.parametrize("rate", [0.5, 5.0])
-def test_bursts_come_as_a_poisson_process(rate: float) -> None:
+def test_bursts_come_as_a_poisson_process() -> None:
     """The pauses of a Poisson process are exponential with mean 1/rate, however long the bursts are and however they
     overlap. Mean and standard deviation are therefore equal; both are held to 5 standard errors."""
-    starts, ends = edges(bursts(rate_hz=rate), 0.01)
+    rate = 0.5
+    starts, ends = edges(bursts(BURSTS_HZ=rate), 0.01)
     pauses = (starts[1:] - ends[:-1] - 15) / FS  # a pause is seen from 15 samples on
     assert np.mean(pauses) == pytest.approx(1 / rate, rel=5 / np.sqrt(pauses.size))
     # relative standard error of the estimated standard deviation of an exponential distribution: sqrt(2/n)
@@ -59,15 +53,15 @@ def lone(x: np.ndarray, decay: float, threshold: float = 0.01, rings_s: float = 
     return starts[(ends - starts < (6 * decay + rings_s) * FS) & (starts < x.size - 8 * decay * FS)]
 
 
-@pytest.mark.parametrize("decay", [0.05, 0.2])
-def test_bursts_die_away_with_their_time_constant(decay: float) -> None:
+def test_bursts_die_away_with_their_time_constant() -> None:
     """The mean power of n lone bursts falls as exp(-2 t/tau).
 
     Each sample of it has a relative error of sqrt(2/n). A slope fitted to its logarithm over 2 tau, that is m samples of
     which the band leaves 0.8 m independent, has an error of sqrt(2/n) sqrt(12/(0.8 m))/(2 tau). The tolerance is 5 of
     these, plus 3 % for the few bursts that overlap unnoticed in the first 30 ms and so seem longer.
     """
-    x = bursts(duration_s=2000.0, rate_hz=0.3, decay_s=decay)
+    decay = 0.2
+    x = bursts(duration_s=2000.0, BURSTS_HZ=0.3, DECAY_S=decay)
     starts = lone(x, decay)
     first, m = 8, round(2 * decay * FS)  # samples of the band's onset, samples fitted
     power = np.mean([x[s + first : s + first + m] ** 2 for s in starts], axis=0)
@@ -76,47 +70,25 @@ def test_bursts_die_away_with_their_time_constant(decay: float) -> None:
     assert -2 / slope == pytest.approx(decay, rel=5 * np.sqrt(2 / starts.size) * np.sqrt(12 / (0.8 * m)) / 4 + 0.03)
 
 
-@pytest.mark.parametrize("background_db", [-30.0, 0.0])
-def test_the_background_has_its_level(background_db: float) -> None:
+def test_the_background_has_its_level() -> None:
     """The background is measured between the bursts, which the same seed without background shows.
 
     800 s with 0.8 degrees of freedom per sample give its power to 5 sqrt(2/640000) = 0.9 %, and the power of bursts and
     background together, which is 1, to the same.
     """
-    starts, ends = edges(bursts(rate_hz=0.5, decay_s=0.01), 1e-3, hold=40)
-    x = bursts(rate_hz=0.5, decay_s=0.01, background_db=background_db)
+    starts, ends = edges(bursts(BURSTS_HZ=0.5, DECAY_S=0.01), 1e-3, hold=40)
+    x = bursts(BURSTS_HZ=0.5, DECAY_S=0.01, BACKGROUND_DB=0.0)
     pause = np.ones(x.size, dtype=bool)
     for start, end in zip(starts, ends, strict=True):
         pause[max(start - 5, 0) : end + 60] = False
-    ratio = 10 ** (background_db / 10)
     assert np.sum(pause) > 800_000
-    assert np.mean(x[pause] ** 2) == pytest.approx(ratio / (1 + ratio), rel=0.025)
+    assert np.mean(x[pause] ** 2) == pytest.approx(0.5, rel=0.025)
 
 
 # ---- Swelling
 
 
-@given(
-    values=st.lists(st.floats(-1e3, 1e3).filter(lambda v: abs(v) > 1e-3), min_size=1, max_size=50),
-    swing=st.floats(0.0, 40.0),
-    period=st.floats(0.01, 100.0),
-    phase=st.floats(-10.0, 10.0),
-)
-@settings(max_examples=60)
-def test_swelling_keeps_the_mean_power_and_its_input(
-    values: list[float], swing: float, period: float, phase: float
-) -> None:
-    x = np.array(values)
-    y = swelling(x, fs=8.0, swing_db=swing, period_s=period, phase_rad=phase)
-    np.testing.assert_array_equal(x, values)
-    assert np.mean(y**2) == pytest.approx(np.mean(x**2), rel=EXACT)
-    gain_db = 20 * np.log10(y / x)  # no sign is turned
-    assert np.ptp(gain_db) <= 2 * swing + 1e-9
-    if swing == 0.0:
-        np.testing.assert_allclose(y, x, rtol=1e-14)
-
-
-@pytest.mark.parametrize(("swing", "period", "phase"), [(6.0, 4.0, 0.0), (3.0, 1.6, 1.0), (12.0, 8.0, -2.5)])
+@pytest.mark.parametrize(("swing", "period", "phase"), [(6.0, 4.0, 0.0), (3.0, 1.6, 1.0)])
 def test_the_level_swings_as_a_sine_of_its_period(swing: float, period: float, phase: float) -> None:
     """The level is measured as the power of noise in each 40th of a period, 0.04 s and more.
 
@@ -125,6 +97,7 @@ def test_the_level_swings_as_a_sine_of_its_period(swing: float, period: float, p
     """
     noise = band_limited_noise((50.0, 1000.0), 10 * period, fs=2000.0, rng=3)
     y = swelling(noise, fs=2000.0, swing_db=swing, period_s=period, phase_rad=phase)
+    assert np.mean(y**2) == pytest.approx(np.mean(noise**2), rel=EXACT)
     level = 10 * np.log10(np.mean(y.reshape(400, -1) ** 2, axis=1))
     spectrum = np.fft.rfft(level - np.mean(level)) / 200
     assert np.argmax(np.abs(spectrum)) == 10  # ten periods
@@ -149,8 +122,7 @@ def test_one_turn_is_the_recording_but_for_the_fade() -> None:
     np.testing.assert_array_equal(looped(RECORDING, 0.5, fs=RATE), y[:2500])
 
 
-@given(turns=st.floats(0.01, 4.0), start=st.floats(0.0, 5.0))
-@settings(max_examples=40)
+@pytest.mark.parametrize(("turns", "start"), [(0.3, 0.9), (2.7, 3.21)])
 def test_it_goes_round_and_begins_anywhere(turns: float, start: float) -> None:
     """Sample n is sample n + start of a loop of one turn."""
     one = looped(RECORDING, TURN / RATE, fs=RATE)
@@ -159,17 +131,11 @@ def test_it_goes_round_and_begins_anywhere(turns: float, start: float) -> None:
     np.testing.assert_array_equal(y, one[(round(start * RATE) + np.arange(y.size)) % TURN])
 
 
-@given(
-    frequency=st.floats(20.0, 400.0),
-    phase=st.floats(0.0, 6.28),
-    samples=st.integers(2001, 6000),
-    start=st.floats(0.0, 1.0),
-)
-@settings(max_examples=40)
-def test_a_tone_has_no_click(frequency: float, phase: float, samples: int, start: float) -> None:
+@pytest.mark.parametrize(("frequency", "samples"), [(20.0, 2001), (113.0, 5987), (400.0, 4321)])
+def test_a_tone_has_no_click(frequency: float, samples: int) -> None:
     """Steps between samples stay below those of both tones under the fade, at most sqrt(2), plus the slope of the fade."""
     turn = 2 * np.pi * frequency / RATE
-    y = looped(np.sin(turn * np.arange(samples) + phase), 3.0, fs=RATE, start_s=start)
+    y = looped(np.sin(turn * np.arange(samples) + 1.0), 3.0, fs=RATE)
     assert np.max(np.abs(np.diff(y))) <= np.sqrt(2) * (turn + np.pi / (2 * FADE))
 
 
@@ -183,43 +149,3 @@ def test_level_jump_scales_the_rest_and_leaves_its_input() -> None:
     np.testing.assert_array_equal(x, kept)
     np.testing.assert_array_equal(louder[:250], x[:250])
     np.testing.assert_allclose(louder[250:], x[250:] * 1.9952623149688795, rtol=1e-15, atol=0)
-
-
-# ---- Channels
-
-
-@pytest.mark.parametrize(
-    "change", [lambda x: level_jump(x, 0.1, 6.0, fs=RATE), lambda x: looped(x, 3.0, fs=RATE, start_s=0.3)]
-)
-def test_channels_are_changed_as_each_alone(change: Any) -> None:
-    x = np.random.default_rng(2).standard_normal((3, 1000))
-    np.testing.assert_array_equal(change(x), [change(channel) for channel in x])
-
-
-@pytest.mark.parametrize(
-    "change", [lambda x: scaled_to_power(x, 3.0), lambda x: swelling(x, fs=RATE, swing_db=6.0, period_s=0.07)]
-)
-def test_channels_share_one_gain_and_one_power(change: Any) -> None:
-    x = np.random.default_rng(2).standard_normal((3, 1000)) * [[1.0], [2.0], [3.0]]
-    y = change(x)
-    gain = y / x
-    np.testing.assert_allclose(gain, np.tile(gain[0], (3, 1)), rtol=1e-12)
-    assert np.mean(y**2) == pytest.approx(np.mean(change(x.ravel()) ** 2), rel=EXACT)
-
-
-# ---- Refusals
-
-
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda: bursty_noise(1.0, fs=FS, rng=1), ValueError, r"band must satisfy .* fs/2 = 500 Hz, got \(100, 1500\)"),
-        (lambda: bursts(1.0, rate_hz=1e-9), ValueError, "no burst fell into .* take a longer duration or a higher"),
-        (lambda: level_jump([1.0, 2.0], 1.0, 6.0, fs=2), ValueError, "at_s must lie within the signal of 1 s"),
-        (lambda: looped(RECORDING, 1.0, fs=RATE, start_s=-1.0), ValueError, "start_s must not be negative"),
-        (lambda: looped("hum", 1.0, fs=RATE), TypeError, "recording must be a sequence of real numbers"),
-    ],
-)
-def test_refusals_say_what_was_wrong(call: Any, error: type, message: str) -> None:
-    with pytest.raises(error, match=message):
-        call()

@@ -13,6 +13,7 @@ from comparisons.bench import Runs, Scene, StudyReport, make_controller
 from comparisons.bench.registry import REGISTRY
 from comparisons.studies import cases
 from kfopc_filterpy import Plant, SimulationResult, simulate
+from kfopc_filterpy.controllers.table import CORE
 
 
 @contextmanager
@@ -33,7 +34,7 @@ def few_settings(several_channels: Any = None) -> Iterator[None]:
     """Leave three of each algorithm's settings, or one; only the named algorithms run with several channels, if any are named."""
     with pytest.MonkeyPatch.context() as patch:
         for name, own in REGISTRY.items():
-            kept = slice(1, 8, 3) if own.in_core else slice(1, 2)  # those in Python take seconds
+            kept = slice(1, 8, 3) if own.make in CORE.values() else slice(1, 2)  # those in Python take seconds
             few = replace(own, first=own.first[kept] or own.first, second=own.second[kept])
             if several_channels is not None:
                 few = replace(few, several_channels=name in several_channels)
