@@ -14,7 +14,6 @@ import numpy as np
 
 from kfopc_filterpy import HardClipAmplifier, Plant, SimulationResult, simulate
 from kfopc_filterpy._types import Counter, NumberOrArray
-from kfopc_filterpy._validate import as_positive, per_loudspeaker
 from kfopc_filterpy.bounds import (
     WienerSolution,
     measurement_noise_from_run,
@@ -124,8 +123,6 @@ class Scene:
         Memory in seconds of the power estimates of the constrained algorithms.
     power_window : {"exponential", "sliding"}, default "exponential"
         Window of these estimates.
-    clips_at : float or ndarray, shape (J,), optional
-        Limit of the amplifiers, if it is not the peak of a sine at rated power.
     """
 
     fs: float
@@ -148,7 +145,6 @@ class Scene:
     known_amplifier: Amplifier | Sequence[Amplifier] | None = None
     power_memory_s: float = 0.5
     power_window: str = "exponential"
-    clips_at: Any = None
 
     @property
     def sensor_noise_seeds(self) -> list[int]:
@@ -157,8 +153,8 @@ class Scene:
 
     @property
     def amplitude_limit(self) -> NumberOrArray:
-        """Limit of the clipping amplifiers, or of each: `clips_at`, by default the peak of a sine at rated power."""
-        limit = np.sqrt(2 * self.rated_power) if self.clips_at is None else self.clips_at
+        """Limit of a clipping amplifier, or of each: the peak of a sine at rated power."""
+        limit = np.sqrt(2 * self.rated_power)
         return limit if np.ndim(limit) else float(limit)
 
     @property
@@ -218,7 +214,7 @@ def make_scene(
     references: Mapping[int, np.ndarray],
     plant: Plant,
     *,
-    rated_power: float,
+    rated_power: NumberOrArray,
     power_multiple: float | None,
     n_taps: int,
     switch_on_s: float = 0.5,
@@ -261,8 +257,7 @@ def make_scene(
     Raises
     ------
     ValueError, TypeError
-        A rated power that is not positive, a noise that is not longer than `switch_on_s`, or one whose channels are not
-        those of the plant.
+        A noise whose channels are not those of the plant.
 
     Examples
     --------
@@ -274,10 +269,10 @@ def make_scene(
     >>> round(float((scene.references[0] ** 2).mean()), 3)  # the path has a gain of 1
     2.0
     """
-    signals = {seed: _as_reference(x, switch_on_s, plant) for seed, x in references.items()}
-    first = next(iter(signals.values()))
-    several = first.ndim == 2
-    rated_power = _as_rating(rated_power, plant if several else None)
+    signals = [checked_references(plant, x) for x in references.values()]
+    several = not has_one_channel(plant, signals[0])
+    signals = signals if several else [x[0] for x in signals]
+    first = signals[0]
     settled = (..., slice(int(switch_on_s * plant.fs), None))  # after the start-up of the primary path
     wiener = reachable_solution(first[settled], plant.disturbance(first)[settled], plant, n_taps)
     asked = np.sum(wiener.control_power)
@@ -285,7 +280,7 @@ def make_scene(
         asked = power_multiple * np.sum(rated_power * np.ones(np.shape(wiener.control_power)))
     share = wiener.control_power / np.sum(wiener.control_power)
     power = _power(first) * asked / np.sum(wiener.control_power)
-    scaled = [np.sqrt(power / _power(x)) * x for x in signals.values()]
+    scaled = [np.sqrt(power / _power(x)) * x for x in signals]
     disturbances = [plant.disturbance(x) for x in scaled]
     std = float(np.sqrt(np.mean(disturbances[0][settled] ** 2)) * 10 ** (sensor_noise_db / 20))
     recorded = disturbances[0][settled]
@@ -359,23 +354,6 @@ def louder(scene: Scene, gain: float) -> Scene:
         measurement_noise=gain**2 * scene.measurement_noise,
         unconstrained_power=gain**2 * scene.unconstrained_power,
     )
-
-
-def _as_rating(rated_power: Any, plant: Plant | None) -> Any:
-    """Return a rated power, or one for each loudspeaker of a plant if several are given."""
-    if plant is None or np.ndim(rated_power) == 0:
-        return as_positive(rated_power, "rated_power")
-    return per_loudspeaker(rated_power, plant.n_loudspeakers, "rated_power")
-
-
-def _as_reference(x: Any, switch_on_s: float, plant: Plant) -> np.ndarray:
-    """Return a noise as (n_samples,), or as (I, n_samples) with several channels."""
-    x = checked_references(plant, x)
-    if x.shape[1] <= int(switch_on_s * plant.fs):
-        raise ValueError(
-            f"references must be longer than switch_on_s = {switch_on_s:g} s, got {x.shape[1] / plant.fs:g} s"
-        )
-    return x[0] if has_one_channel(plant, x) else x
 
 
 def _power(x: np.ndarray) -> float:

@@ -10,10 +10,9 @@ import numpy as np
 
 from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.metrics import convergence_time_s
-from kfopc_filterpy.plot import curve_style
 
 from .. import bench
-from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned
+from ..bench import Claim, Parameter, Runs, Scene, StudyReport, Table, Tuned
 from . import cases
 from . import report_parts as parts
 from .cases import FS, SWITCH_ON_S, WINDOW_S, Case, noises, plants
@@ -104,7 +103,6 @@ def main(runs: Runs) -> StudyReport:
         },
         extra={"convergence_s": settled},
         claims=claims(rows, clipped, settled),
-        figures=[_cases_figure(rows)],
         notes=parts.without_measured(at_hand),
         tables=[_summary_table(rows), amplifier_table(clipped)],
     )
@@ -174,7 +172,7 @@ def claims(rows: Sequence[ConstraintRow], clipped: Sequence[ClippedRow], settled
     ]
 
 
-# ---- Tables and figures
+# ---- Tables
 
 
 def _summary_table(rows: Sequence[ConstraintRow]) -> Table:
@@ -193,27 +191,4 @@ def _summary_table(rows: Sequence[ConstraintRow]) -> Table:
         f"power over {1e3 * WINDOW_S:g} ms over the rated one",
         ["algorithm", "noise", "runs", "power", "below, mean", "below, worst", "worst window"],
         lines,
-    )
-
-
-def _cases_figure(rows: Sequence[ConstraintRow]) -> FigureItem:
-    """Return a figure of a column for each combination of paths and noise, and a mark for each seed."""
-    shortest = min(row.duration_s for row in rows)
-    shown = select(rows, duration_s=shortest, share=SHARES[0])
-    places = list(dict.fromkeys(str(row.case) for row in shown))
-    figure, axes = parts.new_figure((10.5, 7.0), 2, sharex=True)
-    panels = {"loss_db": ("Below the bound (dB)", 0.0), "power": ("Output power / rated power", 1.0)}
-    for (ax,), (value, (label, mark)) in zip(axes, panels.items(), strict=True):
-        for k, name in enumerate(TUNED):
-            own = select(shown, algorithm=name)
-            x = [places.index(str(row.case)) + 0.25 * (k - 1) for row in own]
-            ax.plot(x, column(own, value), **curve_style(name) | {"linestyle": ""}, label=name)
-        ax.axhline(mark, color=parts.MARK, linewidth=1)
-        ax.set_ylabel(label)
-    axes[-1, 0].set_xticks(range(len(places)), places, rotation=40, ha="right", fontsize="small")
-    parts.legend_of(figure, axes[0])
-    return FigureItem(
-        "cases",
-        f"Noise reduction below the bound, and output power ({100 * SHARES[0]:.0f} %, {shortest:g} s, all seeds).",
-        figure,
     )

@@ -14,11 +14,11 @@ from kfopc_filterpy.controllers.kf_pb import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance, identify_secondary_path, path_taps, perturbed_path
 from kfopc_filterpy.signals import band_limited_noise, tone
 
-from ..bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
+from ..bench import Claim, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
 from . import cases
 from . import report_parts as parts
 from .cases import FS, SEED, SENSOR_NOISE_DB, SWITCH_ON_S, Noise, noises, plants
-from .rows import WindowRow, column, figure_table, figures_of, grouped, select, worst_claim
+from .rows import WindowRow, column, figure_table, figures_of, grouped, worst_claim
 
 ALGORITHM = "KF-PB"
 N_TAPS = 128
@@ -41,7 +41,6 @@ NOTHING, DEFAULT, STATED = "nothing", "default", "stated"
 ALLOWANCES = (NOTHING, DEFAULT, STATED)
 COST_DB = 0.5
 Knowledge = tuple[np.ndarray, Any]  # taps of the estimate, and what is stated of its uncertainty
-BOTTOM_DB = -8.0  # of the figure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +97,6 @@ def main(runs: Runs) -> StudyReport:
             "settings": Parameter(settings, "with the exact path"),
         },
         claims=claims(rows),
-        figures=[_figure(rows)],
         notes=[*parts.without_measured(at_hand), _power_note(rows), "There is one seed and one record for each case."],
         tables=[
             louder_table(rows),
@@ -227,36 +225,9 @@ def _power_note(rows: Sequence[AllowanceRow]) -> str:
     )
 
 
-# ---- Tables and figure
+# ---- Tables
 
 
 def _table(rows: Sequence[AllowanceRow], stem: str, caption: str, figure: str) -> Table:
     keys = {"paths": "path", "noise": "noise", "estimate": "error"}
     return figure_table(stem, caption, rows, figure, keys, ALLOWANCES, "allowance")
-
-
-def _figure(rows: Sequence[AllowanceRow]) -> FigureItem:
-    """Return a figure of the worst seconds: a panel for each pair of paths, a group for each error."""
-    names, estimates = list(dict.fromkeys(row.path for row in rows)), [EXACT, IDENTIFIED, *ERRORS]
-    figure, axes = parts.new_figure((10.5, 4.2), 1, len(names), grid="y", sharey=True)
-    markers = {NOTHING: ("x", "C3"), DEFAULT: ("o", "C0"), STATED: ("^", "C2")}
-    bottom = max(BOTTOM_DB, min(-row.louder_db for row in rows))
-    for ax, path in zip(axes[0], names, strict=True):
-        for place, allowance in enumerate(ALLOWANCES):
-            own = select(rows, path=path, allowance=allowance)
-            x = [estimates.index(row.error) + 0.25 * (place - 1) for row in own]
-            y = [max(-row.louder_db, bottom) for row in own]
-            marker, colour = markers[allowance]
-            ax.plot(x, y, marker, color=colour, markersize=5, alpha=0.8, label=allowance)
-        ax.axhline(0.0, color=parts.MARK, linewidth=1)
-        ax.set_xticks(range(len(estimates)), estimates, rotation=40, ha="right", fontsize="small")
-        ax.set_title(path)
-    axes[0, 0].set_ylabel("Worst second: noise reduction (dB)")
-    axes[0, 0].set_ylim(bottom=bottom - 0.5)
-    parts.legend_of(figure, axes[0])
-    return FigureItem(
-        "worst-seconds",
-        "Least noise reduction over a second after the first, for each noise, against what is wrong with the estimate of "
-        f"the secondary path. Below 0 dB the noise is louder than without control; {BOTTOM_DB:g} dB stands for anything below.",
-        figure,
-    )

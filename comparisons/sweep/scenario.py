@@ -10,16 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import (
-    HardClipAmplifier,
-    Plant,
-    SimulationResult,
-    SoftSaturationAmplifier,
-    noise_reduction_db,
-    output_power,
-)
+from kfopc_filterpy import Plant, SimulationResult, noise_reduction_db, output_power
 from kfopc_filterpy._validate import as_number
-from kfopc_filterpy.metrics import clipped_fraction, convergence_time_s, overshoot
+from kfopc_filterpy.metrics import convergence_time_s, overshoot
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot.style import decibels
 from kfopc_filterpy.verdict.runs import AllDivergedError
@@ -40,20 +33,12 @@ DEFAULTS: dict[str, Any] = {
     "algorithm": "KF-OPC",
     "setting": "default",  # r E[x'²]/q, μ L E[x'²] or 1 - λ; or "tuned"
     "rated_power_db": -10.0,  # over the unconstrained control power
-    "amplifier": "linear",
-    "amplifier_limit_db": 0.0,  # over the peak of a sine at rated power
 }
 PATH_ERRORS = ("path_gain_db", "path_delay", "path_phase_deg")
-AMPLIFIERS: dict[str, Callable[[float], Any]] = {  # of the amplitude limit
-    "linear": lambda limit: None,
-    "hard clip": HardClipAmplifier,
-    "soft": SoftSaturationAmplifier,
-}
 CHOICES = {
     "path": (*cases.modelled_plants(), "measured duct"),
     "noise": (*cases.made_noises(), "motor"),
     "algorithm": tuple(algorithms()),
-    "amplifier": tuple(AMPLIFIERS),
 }
 TUNING_SEED = 0  # of the noise on which settings are tuned; those of a sweep begin with 1
 MEASURES: dict[str, Callable[[SimulationResult, Scene], float]] = {
@@ -61,7 +46,6 @@ MEASURES: dict[str, Callable[[SimulationResult, Scene], float]] = {
     "output_power_db": lambda run, scene: float(decibels(output_power(run.control_signal))),
     "power_over_rated": lambda run, scene: output_power(run.control_signal) / scene.rated_power,
     "worst_window_over_rated": lambda run, at: overshoot(run.control_signal, at.rated_power, FS, window_s=WINDOW_S),
-    "clipped_fraction": lambda run, scene: clipped_fraction(run.control_signal, scene.amplitude_limit),
     "convergence_time_s": lambda run, at: convergence_time_s(run.error, run.disturbance, FS, window_s=at.nse_window_s),
 }
 
@@ -100,15 +84,11 @@ def in_the_loop(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def scene_of(values: Mapping[str, Any]) -> Scene:
-    """Return the scene of some values, with its rated power, amplifier and estimated path."""
+    """Return the scene of some values, with its rated power and estimated path."""
     of_noise = ("path", "noise", "duration_s", "n_taps", "sensor_noise_db", "seed")
-    rated_power = 10 ** (values["rated_power_db"] / 10)
-    limit = float(np.sqrt(2 * rated_power) * 10 ** (values["amplifier_limit_db"] / 20))
     return replace(
         _noise_scene(*(values[name] for name in of_noise)),
-        rated_power=rated_power,
-        amplifier=AMPLIFIERS[values["amplifier"]](limit),
-        clips_at=limit,
+        rated_power=10 ** (values["rated_power_db"] / 10),
         secondary_estimate=_estimated_path(values["path"], *(values[name] for name in PATH_ERRORS)),
     )
 
@@ -146,7 +126,6 @@ def _tuned(values: tuple[tuple[str, Any], ...]) -> Setting | None:
     """Return the best setting by the studies' rule; None if all diverge."""
     own = dict(values)
     with suppress(AllDivergedError):
-        return tune(Runs(workers=1), scene_of(own), (own["algorithm"],))[
-            own["algorithm"]
-        ].setting  # other cores have runs
+        (best,) = tune(Runs(workers=1), scene_of(own), (own["algorithm"],)).values()  # other cores have runs
+        return best.setting
     return None

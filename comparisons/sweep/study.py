@@ -256,8 +256,7 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m comparisons sweep",
         description="Run a scenario for every combination of values with every seed, and print means and 95 %% intervals.",
-        epilog="Values are separated by commas; first:last:count are numbers at equal distances, first:last:count:log at "
-        f"equal ratios. Axes of the built-in scenario, and their defaults: {DEFAULTS}. "
+        epilog=f"Values are separated by commas. Axes of the built-in scenario, and their defaults: {DEFAULTS}. "
         "After an interruption, the same command goes on.",
     )
     parser.add_argument("axes", nargs="*", metavar="AXIS=VALUES")
@@ -273,14 +272,14 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_intermixed_args(arguments)
     try:
-        axes = {name: parsed(text, name) for name, _, text in (given.partition("=") for given in options.axes)}
-        seeds = parsed(options.seeds, "seeds")
+        axes = {name: parsed(text) for name, _, text in (given.partition("=") for given in options.axes)}
+        seeds = parsed(options.seeds)
         scenario = in_the_loop if options.scenario is None else pkgutil.resolve_name(options.scenario)
         rows = run_sweep(
             scenario,
             axes if options.scenario else checked_axes(axes),
             options.output,
-            seeds=seeds if len(seeds) > 1 else seeds[0],
+            seeds=seeds[0] if len(seeds) == 1 else seeds,
             jobs=options.jobs,
             scheduler=options.scheduler,
             quiet=options.quiet,
@@ -298,25 +297,15 @@ def main(arguments: Sequence[str]) -> int:
     return 1 if failed else 0
 
 
-def parsed(text: str, name: str) -> list[Any]:
+def parsed(text: str) -> list[Any]:
     """Return the values of a list as the command line has it.
 
     Examples
     --------
-    >>> parsed("-20:0:3,5", "rated_power_db"), parsed("1e-8:1e-6:3:log", "setting"), parsed("KF-OPC,KF-PB", "algorithm")
-    ([-20, -10, 0, 5], [1e-08, 1e-07, 1e-06], ['KF-OPC', 'KF-PB'])
+    >>> parsed("-20,0.5,KF-OPC")
+    [-20, 0.5, 'KF-OPC']
     """
-    values: list[Any] = []
-    for part in text.split(","):
-        first, *rest = part.split(":")
-        if not first or len(rest) not in (0, 2, 3) or rest[2:] not in ([], ["log"]):
-            raise ValueError(f"{name} must be values separated by commas, or first:last:count[:log], got {text!r}")
-        if rest:
-            spaced = np.geomspace if rest[2:] else np.linspace
-            values += [_value(f"{number:.12g}") for number in spaced(float(first), float(rest[0]), int(rest[1]))]
-        else:
-            values.append(_value(first))
-    return values
+    return [_value(part) for part in text.split(",") if part]
 
 
 def _value(text: str) -> Any:

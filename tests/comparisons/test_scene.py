@@ -118,23 +118,6 @@ def test_budget_is_kept_if_every_loudspeaker_keeps_its_own(channels):
     assert not best_setting(channels, "MOV-FxLMS", [one]).within_budget
 
 
-@pytest.mark.parametrize(
-    ("changed", "match"),
-    [
-        ({"rated_power": [-1.0, 2.0]}, "rated_power must be"),
-        ({"rated_power": np.ones(3)}, "one for each of the 2 loudspeakers"),
-        ({"plant": Plant([1.0], [0.0, 1.0], fs=FS)}, "reference must have the 1 channel"),
-        ({"switch_on_s": 1.0}, "longer than switch_on_s"),
-    ],
-    ids=["negative", "three", "one channel", "short"],
-)
-def test_channels_that_do_not_fit_are_refused(changed, match):
-    plant = Plant(random_paths(3, 2, 12, seed=2), random_paths(3, 2, 20, seed=1), fs=FS)
-    settings = {"plant": plant, "rated_power": 1.0, "power_multiple": 3.0, "n_taps": 8, "switch_on_s": 0.1}
-    with pytest.raises(ValueError, match=match):
-        make_scene({0: np.random.default_rng(0).standard_normal((2, 4000))}, **settings | changed)
-
-
 def test_an_algorithm_of_one_channel_is_refused_by_name(channels):
     with pytest.raises(ValueError, match="diagonal KF-OPC is not compared with several channels"):
         make_controller(channels, "diagonal KF-OPC", 1e-6)

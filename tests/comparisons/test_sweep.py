@@ -13,13 +13,12 @@ from helpers.studies import plain_run, smaller
 from scipy import stats
 
 from comparisons.__main__ import main
-from comparisons.bench import Scene, algorithms
+from comparisons.bench import algorithms
 from comparisons.studies.cases import FS, SWITCH_ON_S, make_case, noises, plants
 from comparisons.sweep import scenario, study
-from comparisons.sweep.scenario import DEFAULTS, checked_axes, in_the_loop, scene_of
+from comparisons.sweep.scenario import DEFAULTS, checked_axes, in_the_loop
 from comparisons.sweep.study import means, rows_of, run_sweep
-from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier, power_constrained_wiener
-from kfopc_filterpy.paths import duct_plant, path_taps, perturbed_path
+from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.verdict.runs import AllDivergedError
 
 CALLS: list[int] = []
@@ -155,22 +154,15 @@ def of_simulate(values):
     rated = 10 ** (values["rated_power_db"] / 10)
     errors = {"gain_db": values["path_gain_db"], "delay_samples": values["path_delay"]}
     estimate = path_taps(perturbed_path(scene.secondary, fs=FS, phase_deg=values["path_phase_deg"], **errors))
-    limit = math.sqrt(2 * rated) * 10 ** (values["amplifier_limit_db"] / 20)
-    amplifiers = {"linear": None, "hard clip": HardClipAmplifier(limit), "soft": SoftSaturationAmplifier(limit)}
     scene = replace(scene, secondary_estimate=estimate, rated_power=rated)
-    return plain_run(scene, values["algorithm"], values["setting"], amplifier=amplifiers[values["amplifier"]])
+    return plain_run(scene, values["algorithm"], values["setting"])
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "amplifier"),
-    [("KF-OPC", "linear"), ("KF-PB", "hard clip"), ("FxLMS", "soft"), ("FxRLS", "hard clip")],
-)
-def test_runs_are_those_of_simulate(algorithm, amplifier):
+@pytest.mark.parametrize("algorithm", ["KF-OPC", "FxRLS"])
+def test_runs_are_those_of_simulate(algorithm):
     first = sorted(algorithms()[algorithm].first)
     values = SMALL | {
         "algorithm": algorithm,
-        "amplifier": amplifier,
-        "amplifier_limit_db": -2.0,
         "rated_power_db": -6.0,
         "path": "band-pass",
         "noise": "tone",
@@ -188,29 +180,14 @@ def test_runs_are_those_of_simulate(algorithm, amplifier):
     assert in_the_loop(values | {"setting": "default"}) == figures
 
 
-def test_the_rated_power_is_relative_to_what_the_unconstrained_filter_needs():
-    scene = scene_of(DEFAULTS | {"duration_s": 1.0, "n_taps": 32, "seed": 3})
-    ridge = scene.measurement_noise / (scene.settled[0].size * scene.initial_variance)
-    settings = {"n_taps": 32, "rated_power": 1.0, "switch_on_s": SWITCH_ON_S, "ridge": ridge}
-    bound = power_constrained_wiener(scene.references[0], duct_plant(fs=scene.fs), **settings)
-    assert bound.unconstrained.control_power == pytest.approx(1.0, rel=1e-6)  # least squares of 16000 samples
-
-
 def test_what_diverges_has_no_figures_of_merit():
     values = SMALL | {"path_phase_deg": 180.0, "noise": "tone", "seed": 1}  # an estimate of the wrong sign
     assert in_the_loop(values | {"algorithm": "KF-ANC"}) == {"setting_used": 1e-6, "diverged": True}
     assert not in_the_loop(values | {"algorithm": "KF-OPC"})["diverged"]  # the rated power does not let it
 
-    def refuse(*arguments, **options):
-        error = ValueError("P is not positive definite")
-        error.add_note("in sample 3 of the run")
-        raise error
-
     def all_diverged(*arguments, **options):
         raise AllDivergedError("at every setting")
 
-    with smaller(Scene, run=refuse):
-        assert in_the_loop(values | {"algorithm": "FxRLS"})["diverged"]
     with smaller(scenario, tune=all_diverged):
         assert in_the_loop(values | {"algorithm": "FxLMS", "setting": "tuned", "n_taps": 20}) == {"diverged": True}
 
@@ -229,7 +206,6 @@ def test_measured_paths_are_used_where_they_are_at_hand_and_asked_for_where_not(
     [
         ({"colour": ["red"]}, "no axis called colour; there are path, noise"),
         ({"algorithm": ["KF-XYZ"]}, "algorithm must be one of KF-ANC, KF-OPC, .*got 'KF-XYZ'"),
-        ({"path_delay": ["late"]}, "path_delay must be a single number"),
         ({"setting": ["best"]}, "setting must be a single number"),
         ({"rated_power_db": [math.nan]}, "rated_power_db must be finite"),
     ],
@@ -259,7 +235,7 @@ def test_the_command_prints_means_and_goes_on(tmp_path, capsys):
 def test_the_command_runs_a_function_of_ones_own_and_says_what_failed(tmp_path, monkeypatch, capsys):
     (tmp_path / "own_sweep.py").write_text("def f(values):\n    return {'b': 1 / values['a']}\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    arguments = ["sweep", "--scenario", "own_sweep:f", "a=-1:1:3", "--seeds", "7", "--jobs", "1", "--quiet"]
+    arguments = ["sweep", "--scenario", "own_sweep:f", "a=-1,0,1", "--seeds", "7", "--jobs", "1", "--quiet"]
     assert main([*arguments, "--output", str(tmp_path / "rows")]) == 1
     assert "failed: a=0, seed=1: ZeroDivisionError: division by zero" in capsys.readouterr().err
     assert [row["b"] for row in rows_of(tmp_path / "rows") if row["a"] == -1] == [-1.0] * 7
@@ -277,9 +253,8 @@ def test_an_interrupted_command_says_how_to_go_on(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["n_taps=64,"], "n_taps must be values separated by commas"),
-        (["n_taps=1:2"], "n_taps must be values separated by commas"),
-        (["n_taps"], "n_taps must be values separated by commas"),
+        (["n_taps"], "n_taps must have at least one value"),
+        (["--seeds", ","], "seed must have at least one value"),
         (["a=1"], "no axis called a; there are path"),
         (["--scenario", "math:no_such_function", "a=1"], "'math' has no attribute 'no_such_function'"),
         (["--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"], "not allowed with argument"),
