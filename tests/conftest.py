@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -80,25 +79,6 @@ def shared_data() -> Path:
         setting = f"KFOPC_DATA={named}" if named else "KFOPC_DATA is not set"
         pytest.skip(f"no measured data: {setting}, and {folder} is not a folder")
     return folder
-
-
-@pytest.fixture
-def data_folder(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
-    """Return what names the user's folder of measured data, `KFOPC_DATA`; None takes the name away."""
-
-    def name(folder: Any) -> None:
-        if folder is None:
-            monkeypatch.delenv("KFOPC_DATA", raising=False)
-        else:
-            monkeypatch.setenv("KFOPC_DATA", str(folder))
-
-    return name
-
-
-@pytest.fixture
-def uninstall(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Return what makes a library of an extra missing, as in an environment without it."""
-    return lambda library: monkeypatch.setitem(sys.modules, library, None)
 
 
 @pytest.fixture

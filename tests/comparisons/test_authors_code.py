@@ -5,7 +5,6 @@ All agree to 1e-10, or as the tests say: sums are added up in another order, whi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +54,8 @@ def authors_runs(shared_data: Path) -> Any:
 
 
 @pytest.fixture(params=CASES)
-def case(
-    request: pytest.FixtureRequest, shared_data: Path, authors_runs: Any, data_folder: Callable[[Any], None]
-) -> Case:
-    data_folder(shared_data)
+def case(request: pytest.FixtureRequest, shared_data: Path, authors_runs: Any, monkeypatch: pytest.MonkeyPatch) -> Case:
+    monkeypatch.setenv("KFOPC_DATA", str(shared_data))
     return Case(authors_runs, request.param)
 
 

@@ -152,8 +152,8 @@ def test_a_case_is_what_it_says(scenes: Any, noise: str) -> None:
     assert (scene.rated_power, scene.n_taps, scene.switch_on_s) == (1.0, 160, 0.5)
 
 
-def test_measured_data_join_where_they_are_at_hand(shared_data: Any, data_folder: Any) -> None:
-    data_folder(shared_data)
+def test_measured_data_join_where_they_are_at_hand(shared_data: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KFOPC_DATA", str(shared_data))
     cases.measured_data.cache_clear()
     plants, made = cases.plants(), cases.noises()
     cases.measured_data.cache_clear()

@@ -192,11 +192,11 @@ def test_what_diverges_has_no_figures_of_merit():
         assert in_the_loop(values | {"algorithm": "FxLMS", "setting": "tuned", "n_taps": 20}) == {"diverged": True}
 
 
-def test_measured_paths_are_used_where_they_are_at_hand_and_asked_for_where_not(shared_data, data_folder):
+def test_measured_paths_are_used_where_they_are_at_hand_and_asked_for_where_not(shared_data, monkeypatch):
     values = SMALL | {"path": "measured duct", "noise": "motor", "seed": 1}
     with smaller(), pytest.raises(ValueError, match="motor needs the measured data: set KFOPC_DATA"):
         in_the_loop(values)
-    data_folder(shared_data)
+    monkeypatch.setenv("KFOPC_DATA", str(shared_data))
     scenario.cases.measured_data.cache_clear()
     assert math.isfinite(in_the_loop(values)["noise_reduction_db"])
 

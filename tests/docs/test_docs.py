@@ -87,8 +87,8 @@ def test_a_page_that_loads_something_from_a_network_fails_the_build(tmp_path, lo
         offline.require_offline(app, None)
 
 
-def test_without_mathjax_the_error_names_what_to_install(uninstall):
-    uninstall("sphinx-mathjax-offline")
+def test_without_mathjax_the_error_names_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "sphinx-mathjax-offline", None)
     with pytest.raises(ModuleNotFoundError, match=r"sphinx-mathjax-offline; install the extra"):
         offline.mathjax_file()
 

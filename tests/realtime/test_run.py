@@ -502,8 +502,8 @@ def test_an_error_in_a_run_is_not_hidden_by_one_of_the_card(monkeypatch: pytest.
         run(fx_lms(32, S, step_size=1e-3), device, amplitude_limit=10.0)
 
 
-def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(uninstall: Callable[[str], None]) -> None:
-    uninstall("sounddevice")
+def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "sounddevice", None)
     with pytest.raises(ImportError, match=r"pip install -e .\.\[realtime\]."):
         SoundDevice([0], [1], fs=FS).start()
 

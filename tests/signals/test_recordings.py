@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import struct
+import sys
 import wave
 import zipfile
 
@@ -352,9 +353,9 @@ def test_nothing_is_unpickled(tmp_path):
     assert not (tmp_path / "sprung").exists()
 
 
-def test_without_its_library_the_error_names_the_extra(tmp_path, uninstall):
+def test_without_its_library_the_error_names_the_extra(tmp_path, monkeypatch):
     WRITERS["new.mat"](tmp_path / "new.mat")
-    uninstall("h5py")
+    monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ModuleNotFoundError, match=r"new\.mat is .* which needs h5py: .*pip install -e .\.\[formats\]."):
         read_recording(tmp_path / "new.mat")
 
