@@ -124,7 +124,10 @@ def test_scaled_signal_has_the_power_and_the_shape(values, power):
     np.testing.assert_array_equal(np.sign(scaled[np.abs(scaled) > 0]), np.sign(np.array(values))[np.abs(scaled) > 0])
     # Scaling again to the same power changes nothing but rounding.
     np.testing.assert_allclose(scaled_to_power(scaled, power), scaled, rtol=1e-12, atol=0)
-    np.testing.assert_allclose(scaled_to_power([values, values], power), [scaled, scaled], rtol=1e-12, atol=0)
+
+
+def test_channels_are_scaled_by_one_gain():
+    np.testing.assert_allclose(scaled_to_power([[1.0, -1.0], [2.0, 2.0]], 10.0), [[2.0, -2.0], [4.0, 4.0]], rtol=1e-12)
 
 
 @pytest.mark.parametrize(
