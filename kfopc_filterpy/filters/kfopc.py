@@ -11,16 +11,15 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PerLoudspeaker
-from .._validate import as_count, as_finite_array, as_nonnegative, as_number, as_signal, require_finite
+from .._validate import as_count, as_finite_array, as_nonnegative, as_number, require_finite
 from ..checkpoint import Checkpointed
 from . import checked_steps
 
 if TYPE_CHECKING:
     from ..power.constraint import OutputPowerConstraint
-    from ..power.shared_constraint import SharedConstraint
     from .random_walk import RandomWalkKFOPC
 
+ONE_CHANNEL = "kf_opc takes several loudspeakers and microphones"
 EQUAL_ROWS = 10  # steps in which H may be the same: the reference of noise control changes from sample to sample
 TRACKER = (
     "a rated power scales what weights drive an actuator with, and H has the newest reference samples. This filter tracks "
@@ -65,16 +64,16 @@ class KFOPC(KalmanFilter, Checkpointed):
     Parameters
     ----------
     dim_x : int
-        Number of states; for active noise control the taps of the control filter, or of all control filters.
+        Number of states; for active noise control the taps of the control filter.
     dim_z : int, default 1
-        Number of measurements; for active noise control the number of error microphones.
+        Number of measurements; 1 with a rated power.
     dim_u : int, default 0
         Number of control inputs.
-    rated_power : float or array_like, shape (J,), optional
-        Rated output power (mean square of the control signal), or that of each of J loudspeakers. None: no constraint.
+    rated_power : float, optional
+        Rated output power (mean square of the control signal). None: no constraint.
     fs : float, optional
         Sample rate in Hz, which a rated power needs, also one that is assigned later: its power estimates remember 0.5 s.
-    constraint : OutputPowerConstraint or sequence of J of them, optional
+    constraint : OutputPowerConstraint, optional
         Given instead of `rated_power` and `fs` to set also the memory of the power estimates or a known secondary-path
         gain. The filter keeps a copy. By default the gain is estimated from the newest sample of H and
         the `reference` given to `update` (eq. 11).
@@ -92,25 +91,17 @@ class KFOPC(KalmanFilter, Checkpointed):
     TypeError
         A dimension that is not a whole number.
     ValueError
-        A dimension out of range, a `dim_x` that is not a multiple of the number of loudspeakers, a power or a rate that
-        is not positive, a rated power without a rate, a constraint beside one of them.
+        A dimension out of range, a power or a rate that is not positive, a rated power without a rate or with several
+        measurements, a constraint beside one of them.
 
     See Also
     --------
     KFOPC.random_walk : the filter of eq. 1-8 in O(L^2) per sample.
+    kf_opc : the controller, for any number of loudspeakers, microphones and references.
 
     Notes
     -----
     filterpy's ``alpha`` is its fading memory; the paper's :math:`\alpha` is `constraint_factor` here.
-
-    With J loudspeakers, I references and K microphones, the states are the control filters in the order (J, I, taps),
-    newest-sample tap first, and row k of H is the filtered references x'_kji of microphone k in that order. All
-    measurements are scaled by one factor, the smallest of those that eq. 13 gives each loudspeaker as if it were alone.
-    The disturbance power is summed over microphones, and the gain is the power of the loudspeaker's filtered
-    references, summed over microphones, divided by that of the references. This extension is the package's, not the
-    paper's. `rated_power`, `disturbance_power` and `secondary_path_gain` are then (J,).
-
-    See also `kf_opc`, whose filter for several channels takes O(K dim_x^2) per sample.
 
     References
     ----------
@@ -128,15 +119,6 @@ class KFOPC(KalmanFilter, Checkpointed):
     0.25
     >>> kf.y  # 0.25 * 4 - 0
     array([[1.]])
-
-    Two loudspeakers of two taps each, and one microphone:
-
-    >>> kf = KFOPC(dim_x=4, rated_power=[1.0, 0.25], fs=16000)
-    >>> kf.update(4.0, H=np.array([1.0, 0.0, 2.0, 0.0]), reference=1.0)
-    >>> kf.secondary_path_gain
-    array([1., 4.])
-    >>> kf.constraint_factor  # the smaller of sqrt(1 * 1 / 16) and sqrt(0.25 * 4 / 16)
-    0.25
     """
 
     _in_place: ClassVar[tuple[str, ...]] = ("_constraint", "_written")  # attributes that steps write into
@@ -155,9 +137,9 @@ class KFOPC(KalmanFilter, Checkpointed):
         dim_z: int = 1,
         dim_u: int = 0,
         *,
-        rated_power: PerLoudspeaker | None = None,
+        rated_power: float | None = None,
         fs: float | None = None,
-        constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
+        constraint: OutputPowerConstraint | None = None,
     ) -> None:
         self._constraint: Any = None
         self._settings: Any = None  # those of the next constraint: of `fs`, or of the constraint that was lifted
@@ -165,7 +147,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         self._moved = False  # by a control input
         self._written, self._writes = [0], 0  # steps that wrote in place, see `_require_whole`
         dim_x, dim_z = as_count(dim_x, "dim_x"), as_count(dim_z, "dim_z")
-        self._row = np.zeros((dim_z, dim_x))  # the last H with a rated power,
+        self._row = np.zeros(dim_x)  # the last H with a rated power,
         self._equal_rows = 0  # in how many steps it has been the same, and -1 once it has changed
         super().__init__(dim_x, dim_z, dim_u)
         if constraint is not None:
@@ -265,7 +247,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         R: ArrayLike | None = None,
         H: ArrayLike | None = None,
         *,
-        reference: ArrayLike | None = None,
+        reference: float | None = None,
     ) -> None:
         """Correct the state with a measurement, scaled by the constraint factor (eq. 9).
 
@@ -279,18 +261,17 @@ class KFOPC(KalmanFilter, Checkpointed):
         R : float or array_like, optional
             Measurement noise variance of this step; by default `self.R`.
         H : array_like, optional
-            Observation of this step, (n,) or (dim_z, n); by default `self.H`. With a rated power, the first element of
-            each control filter's part is the newest filtered reference x'(n).
-        reference : float or array_like, shape (I,), optional
-            Newest reference x(n), which with x'(n) gives the secondary-path gain (eq. 11). With several references, the
-            rated powers must be a sequence, even for one loudspeaker.
+            Observation of this step, (n,) or (dim_z, n); by default `self.H`. With a rated power, its first element is
+            the newest filtered reference x'(n).
+        reference : float, optional
+            Newest reference x(n), which with x'(n) gives the secondary-path gain (eq. 11).
 
         Raises
         ------
         ValueError
             NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, a silent reference
-            with R = 0, or a rated power with neither a reference nor a secondary-path gain, or with only some of the
-            measurements. The filter is unchanged and can continue.
+            with R = 0, or a rated power with neither a reference nor a secondary-path gain. The filter is unchanged and
+            can continue.
         TypeError
             A measurement that is not a real number.
 
@@ -307,8 +288,6 @@ class KFOPC(KalmanFilter, Checkpointed):
         missing = None
         if isinstance(z, np.ma.MaskedArray):
             z, R, H, missing = checked_steps.without_masked(self, z, R, H)
-            if missing is not None and self._constraint is not None:
-                raise ValueError("a rated power needs all measurements at once: mask them all if one is missing")
         plain = self._constraint is None and self._unconstrained_factor == 1.0
         if z is None:
             super().update(None)
@@ -328,7 +307,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         self._all_or_nothing(super().predict_steadystate, None, u, B)
         self._moved = self._moved or self._has_input(u, B)
 
-    def update_steadystate(self, z: ArrayLike | None, *, reference: ArrayLike | None = None) -> None:
+    def update_steadystate(self, z: ArrayLike | None, *, reference: float | None = None) -> None:
         """Run filterpy's `update_steadystate` with the measurement scaled; see `update`."""
         if z is None:
             super().update_steadystate(None)
@@ -343,7 +322,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         R: ArrayLike | None = None,
         H: ArrayLike | None = None,
         *,
-        reference: ArrayLike | None = None,
+        reference: float | None = None,
     ) -> None:
         """Run filterpy's `update_correlated` with the measurement scaled; see `update`. `M` is (dim_x, dim_z)."""
         if z is None:
@@ -360,7 +339,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         R_i: ArrayLike | None = None,
         H_i: ArrayLike | None = None,
         *,
-        reference: ArrayLike | None = None,
+        reference: float | None = None,
     ) -> None:
         """Run filterpy's `update_sequential` (filterpy 2.0.0) with the measurement scaled; see `update`."""
         if not hasattr(KalmanFilter, "update_sequential"):
@@ -391,14 +370,13 @@ class KFOPC(KalmanFilter, Checkpointed):
     ) -> None:
         """Run a step on the scaled measurement (eq. 9), then accept its powers; an error leaves the filter unchanged."""
         factor = self.constraint_factor
-        reference = None if reference is None else self._checked_reference(reference)
+        reference = None if reference is None else as_number(reference, "reference")
         if self._constraint is not None:
-            rows = self.H if H is None else H
+            row = np.ravel(self.H if H is None else H)
             self._require_whole()
             self._require_random_walk(self.F)
-            self._require_other_row(rows)
-            shared, sample = self._powers_sample(z, rows, reference)
-            factor = shared.preview(*sample)
+            self._require_other_row(row)
+            factor = self._constraint.preview(float(np.asarray(z).item()), row[0], reference)
         self._all_or_nothing(step, None, self._scaled(z, factor), *others)
         if factor != 1.0:  # store z as given, not scaled, in filterpy's shape
             if start is None:
@@ -407,67 +385,48 @@ class KFOPC(KalmanFilter, Checkpointed):
                 self.z[start : start + np.size(z)] = np.reshape(z, (-1, 1))
         if self._constraint is not None:
             self._written[0] += 1
-            shared.accept()
-            self._note_row(rows)
+            self._constraint.accept()
+            self._note_row(row)
             self._writes += 1
 
     # The constraint: its values can be read, or supplied by the caller.
 
     @property
-    def rated_power(self) -> NumberOrArray | None:
-        """Rated output power, or that of each loudspeaker, (J,); assign another, or None to lift the constraint."""
+    def rated_power(self) -> float | None:
+        """Rated output power; assign another, or None to lift the constraint."""
         return None if self._constraint is None else self._constraint.rated_power
 
     @rated_power.setter
-    def rated_power(self, value: PerLoudspeaker | None) -> None:
-        powers: Any = value
-        one = np.ndim(powers) == 0
+    def rated_power(self, value: float | None) -> None:
         if value is None:
             self._settings, self._constraint = self._constraint or self._settings, None
-        elif self._constraint is not None and (one or isinstance(self._constraint, tuple)):
+        elif self._constraint is not None:
             self._constraint.rated_power = value
+        elif self._settings is None:
+            raise ValueError(
+                "a rated power needs the sample rate, for its power estimates: give fs= where the filter is made, or "
+                "assign kf.constraint = OutputPowerConstraint(rated_power, fs=...)"
+            )
         else:
-            settings = self._constraint or self._settings
-            if settings is None:
-                raise ValueError(
-                    "a rated power needs the sample rate, for its power estimates: give fs= where the filter is made, or "
-                    "assign kf.constraint = OutputPowerConstraint(rated_power, fs=...)"
-                )
-            together = one or isinstance(settings, tuple)
-            self.constraint = settings.fresh(powers) if together else [settings.fresh(power) for power in powers]
+            self.constraint = self._settings.fresh(value)
 
     @property
     def constraint(self) -> Any:
-        """Constraint that computes the powers and the factor; None without a rated power. Assignment stores a copy.
-
-        For several loudspeakers it is a tuple, one for each.
-        """
+        """Constraint that computes the powers and the factor; None without a rated power. Assignment stores a copy."""
         return self._constraint
 
     @constraint.setter
-    def constraint(self, value: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None) -> None:
+    def constraint(self, value: OutputPowerConstraint | None) -> None:
+        from ..power.constraint import OutputPowerConstraint
+
         if value is None:
             self.rated_power = None
-        else:
-            self._constraint = self._own_constraint(value)
-
-    def _own_constraint(self, value: Any) -> Any:
-        """Return a copy of a constraint, or of one for each loudspeaker."""
-        from ..power.constraint import OutputPowerConstraint
-        from ..power.shared_constraint import SharedConstraint
-
-        each = value if isinstance(value, list | tuple) else [value]
-        if not each or not all(isinstance(one, OutputPowerConstraint) for one in each):
-            raise TypeError(
-                f"constraint must be an OutputPowerConstraint or None, got {value!r}; "
-                "for several loudspeakers, a sequence of them"
-            )
-        if self.dim_x % len(each):
-            raise ValueError(
-                f"dim_x = {self.dim_x} states cannot be the control filters of {len(each)} loudspeakers: "
-                "they have equal lengths, in the order (loudspeakers, references, taps)"
-            )
-        return SharedConstraint(deepcopy(one) for one in each) if each is value else deepcopy(value)
+            return
+        if not isinstance(value, OutputPowerConstraint):
+            raise TypeError(f"constraint must be an OutputPowerConstraint or None, got {value!r}; {ONE_CHANNEL}")
+        if self.dim_z != 1:
+            raise ValueError(f"a rated power needs one measurement, dim_z = 1, got dim_z = {self.dim_z}; {ONE_CHANNEL}")
+        self._constraint = deepcopy(value)
 
     @property
     def constraint_factor(self) -> float:
@@ -482,49 +441,27 @@ class KFOPC(KalmanFilter, Checkpointed):
             self._unconstrained_factor = 1.0 if value is None else as_nonnegative(value, "constraint_factor")
 
     @property
-    def disturbance_power(self) -> NumberOrArray | None:
+    def disturbance_power(self) -> float | None:
         """Disturbance power delta_d^2 last used (eq. 10), None without a rated power; can be supplied."""
         return None if self._constraint is None else self._constraint.disturbance_power
 
     @disturbance_power.setter
-    def disturbance_power(self, value: PerLoudspeaker) -> None:
+    def disturbance_power(self, value: float | None) -> None:
         self._require_constraint("disturbance_power").disturbance_power = value
 
     @property
-    def secondary_path_gain(self) -> NumberOrArray | None:
+    def secondary_path_gain(self) -> float | None:
         """Secondary-path power gain G_s last used (eq. 11), None before any is known; can be supplied."""
         return None if self._constraint is None else self._constraint.secondary_path_gain
 
     @secondary_path_gain.setter
-    def secondary_path_gain(self, value: PerLoudspeaker) -> None:
+    def secondary_path_gain(self, value: float | None) -> None:
         self._require_constraint("secondary_path_gain").secondary_path_gain = value
 
     def _require_constraint(self, name: str) -> Any:
         if self._constraint is None:
             raise ValueError(f"{name} needs a constraint: set rated_power first")
         return self._constraint
-
-    def _checked_reference(self, reference: Any) -> Any:
-        """Return a reference as a number, or several as (I,) if the rated powers are listed for loudspeakers."""
-        one = np.size(reference) == 1 or not isinstance(self._constraint or self._settings, tuple)
-        return as_number(reference, "reference") if one else as_signal(reference, "reference")
-
-    def _powers_sample(self, z: Any, H: Any, reference: Any) -> tuple[SharedConstraint, tuple[Any, Any, Any]]:
-        """Return the constraint, and what it takes: measurements, newest filtered references, references."""
-        from ..power.shared_constraint import SharedConstraint
-
-        shared: Any = self._constraint if isinstance(self._constraint, tuple) else SharedConstraint([self._constraint])
-        rows = np.reshape(H, (-1, self.dim_x))
-        if len(rows) != self.dim_z:
-            raise ValueError(f"a rated power needs all dim_z = {self.dim_z} measurements, rows of H, got {len(rows)}")
-        filters = len(shared), 1 if reference is None else np.size(reference)
-        if self.dim_x % (filters[0] * filters[1]):
-            raise ValueError(
-                f"reference must have one sample for each reference, but dim_x = {self.dim_x} states cannot be the "
-                f"control filters of {filters[0]} loudspeaker(s) for {filters[1]} reference(s)"
-            )
-        newest = rows.reshape(self.dim_z, *filters, -1)[..., 0].swapaxes(0, 1)
-        return shared, (z, newest, reference)
 
     # A rated power is for weights that drive an actuator, not for a state that is tracked.
 
@@ -535,13 +472,13 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     def _require_other_row(self, H: Any) -> None:
         """Raise an error if H does not change."""
-        if self._equal_rows >= EQUAL_ROWS and np.any(H) and np.array_equal(np.reshape(H, self._row.shape), self._row):
+        if self._equal_rows >= EQUAL_ROWS and np.any(H) and np.array_equal(H, self._row):
             raise ValueError(f"with a rated power, H must change, but was the same in {EQUAL_ROWS} steps: {TRACKER}")
 
     def _note_row(self, H: Any) -> None:
         """Count the steps with the same H, until there is another."""
         if self._equal_rows >= 0:
-            row = np.array(H, dtype=np.float64).reshape(self._row.shape)
+            row = np.array(H, dtype=np.float64)
             same = self._equal_rows == 0 or np.array_equal(row, self._row)
             self._row, self._equal_rows = row, self._equal_rows + 1 if same else -1
 
@@ -570,7 +507,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         Fs, Qs, Hs, Rs, Bs, us, update_first, saver
             As in filterpy; each step of `Hs` may be (n,).
         references : array_like, optional
-            (len(zs),) reference samples x(n), or (len(zs), I), for a filter with a rated power.
+            (len(zs),) reference samples x(n), for a filter with a rated power.
 
         Returns
         -------

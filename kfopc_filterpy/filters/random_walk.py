@@ -153,7 +153,7 @@ class RandomWalkKFOPC(KFOPC):
         R: ArrayLike | None = None,
         H: ArrayLike | None = None,
         *,
-        reference: ArrayLike | None = None,
+        reference: float | None = None,
     ) -> None:
         """Apply eq. 5-9; an H of several rows, or another `inv`, uses filterpy's own equations. See `KFOPC.update`."""
         plain = self._plain(z, R, H)
@@ -172,7 +172,7 @@ class RandomWalkKFOPC(KFOPC):
             self._require_other_row(h)
             factor = constraint.preview(d, h[0], reference)
         elif reference is not None:
-            self._checked_reference(reference)
+            as_number(reference, "reference")
         diagonal, bound, blurred = self._diagonal, self._bound, self._blurred
         if blurred:
             diagonal = max(diagonal, LEAST_NOISE * self._largest_variance())
@@ -295,16 +295,3 @@ class RandomWalkKFOPC(KFOPC):
         for name in ("F", "Q", "R"):
             if self.__dict__[name].flags.writeable:
                 setattr(self, name, self.__dict__[name])
-
-    def _own_constraint(self, value: Any) -> OutputPowerConstraint:
-        """Return a copy of a constraint; there is one loudspeaker."""
-        if isinstance(value, list | tuple):
-            raise TypeError(
-                "this filter has one loudspeaker, so its rated power or constraint must be one, not a sequence of "
-                f"{len(value)}: for several, use KFOPC(dim_x, dim_z), or kf_opc with secondary paths (K, J, taps)"
-            )
-        return super()._own_constraint(value)
-
-    def _checked_reference(self, reference: Any) -> float:
-        """Return a reference as a number; there is one."""
-        return as_number(reference, "reference")

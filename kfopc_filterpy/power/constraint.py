@@ -154,18 +154,25 @@ class OutputPowerConstraint:
     def secondary_path_gain(self, value: float | None) -> None:
         self._supply("gain", None if value is None else as_positive(value, "secondary_path_gain"))
 
-    @property
-    def needs_reference(self) -> bool:
-        """True if the gain must be estimated from the reference: neither the gain nor the factor was supplied."""
-        numbers = self._state.numbers
-        return math.isnan(numbers["supplied_gain"][0]) and math.isnan(numbers["supplied_factor"][0])
-
     def preview(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
         """Return the constraint factor with this sample; the powers change only if `accept` follows.
 
         `disturbance`, `filtered_reference` and `reference` are those of `advance`.
         """
-        return self.preview_sums(*self._squares(disturbance, filtered_reference, reference))
+        supplied = self._state.numbers[["supplied_gain", "supplied_factor"]].item()
+        if reference is None and all(map(math.isnan, supplied)):
+            raise ValueError(
+                "the secondary-path gain is unknown: pass reference=, the newest reference sample x(n), "
+                "or set secondary_path_gain"
+            )
+        room = self._opened()
+        room.previewed["square"] = (
+            squared(disturbance, "the measurement"),
+            squared(filtered_reference, "the newest filtered reference"),
+            math.nan if reference is None else squared(reference, "reference"),
+        )
+        preview(*room.places)
+        return float(room.previewed["factor"][0])
 
     def accept(self) -> float:
         """Add the sample of the last `preview` to the powers and return the constraint factor."""
@@ -198,21 +205,6 @@ class OutputPowerConstraint:
         self.preview(disturbance, filtered_reference, reference)
         return self.accept()
 
-    def preview_sums(self, d_squared: float, xf_squared: float, x_squared: float | None) -> float:
-        """Return what `preview` does for the squares of a sample, or for their sums over channels.
-
-        `d_squared`, `xf_squared` and `x_squared` are those of `preview`'s arguments.
-        """
-        room = self._opened()
-        room.previewed["square"] = d_squared, xf_squared, self._known(x_squared)
-        preview(*room.places)
-        return float(room.previewed["factor"][0])
-
-    @property
-    def previewed_gain(self) -> float:
-        """Power gain with the sample of the last `preview`, NaN if it is unknown."""
-        return float(self._opened().previewed["gain"][0])
-
     def _opened(self) -> _Room:
         """Return the room for a preview; that of a copy is made when it is first used."""
         if self._room is None:
@@ -232,20 +224,6 @@ class OutputPowerConstraint:
         for own, place in zip(state, places, strict=True):
             place[...] = own
         self._state, self._room = places, None
-
-    def _known(self, x_squared: float | None) -> float:
-        """Return the square of the reference, NaN if none is given and none is needed."""
-        if x_squared is None and self.needs_reference:
-            raise ValueError(
-                "the secondary-path gain is unknown: pass reference=, the newest reference sample x(n), "
-                "or set secondary_path_gain"
-            )
-        return math.nan if x_squared is None else x_squared
-
-    @staticmethod
-    def _squares(disturbance: Any, filtered: Any, reference: Any) -> tuple[float, float, float | None]:
-        x_squared = None if reference is None else squared(reference, "reference")
-        return squared(disturbance, "the measurement"), squared(filtered, "the newest filtered reference"), x_squared
 
     def _read(self, name: str) -> float:
         supplied = self._state.numbers[f"supplied_{name}"][0]

@@ -1,6 +1,7 @@
-"""What else of filterpy uses a filter, with KFOPC in the place of KalmanFilter: the same bits.
+"""filterpy's IMM with KFOPC in the place of KalmanFilter, and the smoother with what filterpy's leaves out.
 
-The steps themselves are compared in `test_against_filterpy.py`. The page's last table lists the parts of both files.
+The steps themselves are compared in `test_against_filterpy.py`. What else uses a filter is in filterpy's own tests, which
+`test_filterpy_own_tests.py` runs.
 """
 
 from __future__ import annotations
@@ -11,11 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filterpy.common import Q_discrete_white_noise, Saver, inv_diagonal
-from filterpy.kalman import FixedLagSmoother, IMMEstimator, KalmanFilter, MMAEFilterBank
-from filterpy.kalman import kalman_filter as functions
+from filterpy.common import Saver
+from filterpy.kalman import IMMEstimator, KalmanFilter
 from helpers.filterpys import Oracle
-from helpers.pages import ROOT, table_of
 
 from kfopc_filterpy import KFOPC
 
@@ -31,97 +30,6 @@ def same(a: Any, b: Any) -> bool:
     return type(a) is type(b) and a == b
 
 
-def constant_velocity(kind: type) -> Any:
-    kf = kind(dim_x=2, dim_z=1)
-    kf.x, kf.F, kf.H = np.array([[2.0, 0.0]]).T, np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]])
-    kf.P *= 1000.0
-    kf.R, kf.Q = kf.R * 5.0, Q_discrete_white_noise(2, 1.0, 0.01)
-    return kf
-
-
-def numbers(kind: type) -> list:
-    """A batch takes a number in Q as a multiple of the identity; steps and the smoother add it to every element."""
-    kf = constant_velocity(kind)
-    kf.P, kf.R, kf.Q = 0.01, 5, 0.001
-    means, covariances, _, _ = kf.batch_filter(Z, update_first=True)
-    kf.predict()
-    return [means, covariances, kf.P, *kf.rts_smoother(means, covariances, Fs=[kf.F] * len(Z))]
-
-
-def pair_of_models(kind: type) -> list[Any]:
-    """Constant acceleration, with much noise and with little."""
-    filters = []
-    for var in (0.02, 0.5):
-        kf = kind(3, 1)
-        kf.x, kf.H = np.zeros(3), np.array([[1.0, 0, 0]])
-        kf.P *= 3
-        kf.R *= 0.36
-        kf.F, kf.Q = np.array([[1, 0.1, 0.005], [0, 1, 0.1], [0, 0, 1]]), Q_discrete_white_noise(3, 0.1, var)
-        filters.append(kf)
-    return filters
-
-
-def multiple_models(kind: type) -> list:
-    filters = pair_of_models(kind)
-    filters[0].F[:, 2] = 0
-    filters[0].P[2, 2] = filters[0].Q[2, 2] = 0
-    bank = MMAEFilterBank(filters, (0.5, 0.5), dim_x=3, H=filters[0].H)
-    seen = []
-    for z in Z[:20]:
-        bank.predict()
-        bank.update(z)
-        seen += [bank.x, bank.P, np.array(bank.p), filters[0].likelihood]
-    return seen
-
-
-def fixed_lag(kind: type) -> list:
-    kf, smoother = constant_velocity(kind), FixedLagSmoother(dim_x=2, dim_z=1, N=5)
-    for name in ("x", "P", "F", "H", "Q", "R"):
-        setattr(smoother, name, getattr(kf, name))
-    for z in Z[:30]:
-        kf.predict()
-        kf.update(z)
-        smoother.smooth(z)
-    return [kf.x, smoother.x, *smoother.xSmooth, *smoother.smooth_batch(Z[:30], N=5)]
-
-
-def procedural(kind: type) -> list:
-    kf, n = constant_velocity(kind), 20
-    x, P = functions.predict(kf.x, kf.P, F=kf.F, Q=kf.Q)
-    x, P = functions.update(x, P, 4.0, kf.R, kf.H)
-    means, covariances, _, _ = functions.batch_filter(x, P, Z[:n], [kf.F] * n, [kf.Q] * n, [kf.H] * n, [kf.R] * n)
-    return [x, P, means, covariances, *functions.rts_smoother(means, covariances, [kf.F] * n, [kf.Q] * n)]
-
-
-USES: dict[str, Callable[[type], list]] = {
-    "`batch_filter`, `rts_smoother`": numbers,
-    "`FixedLagSmoother`": fixed_lag,
-    "`MMAEFilterBank`": multiple_models,
-    "`predict`, `update`, `batch_filter`, `rts_smoother` as functions": procedural,
-}
-IN_THE_MACHINE = [
-    "`predict`, `update`",
-    "`predict_steadystate`, `update_steadystate`",
-    "`update_correlated`",
-    "`update_sequential`",
-    "`get_prediction`, `get_update`",
-    "`residual_of`, `log_likelihood_of`, `measurement_of_state`",
-    "`copy`, `deepcopy`, `pickle`",
-    "`alpha`",
-    "`Saver`",
-]
-
-
-@pytest.mark.parametrize("use", USES)
-def test_a_filterpy_use_gives_the_same_bits(use: str) -> None:
-    expected, got = (USES[use](kind) for kind in (Oracle, KFOPC))
-    assert same(expected, got)
-    assert expected, "the use saw nothing"
-
-
-# Uses that have a random walk, too: they get a function that makes a filter with a state noise.
-
-
 def interacting_models(make: Callable[[float], Any], estimator: type = IMMEstimator) -> list:
     bank = estimator([make(1e-4), make(1e-1)], (0.5, 0.5), np.array([[0.97, 0.03], [0.03, 0.97]]))
     saver, seen = Saver(bank, ignore=("filters",)), []
@@ -130,20 +38,6 @@ def interacting_models(make: Callable[[float], Any], estimator: type = IMMEstima
         bank.update(np.array([[z]]))
         saver.save()
         seen += [bank.x, bank.P, bank.mu, bank.filters[0].x, bank.filters[1].P, bank.filters[0].likelihood]
-    return seen
-
-
-def inverses(make: Callable[[float], Any]) -> list:
-    seen = []
-    for inverse in (np.linalg.pinv, inv_diagonal):
-        kf = make(0.5)
-        kf.inv = inverse
-        for z in Z[:10]:
-            kf.predict()
-            kf.update(np.array([[z]]))
-        if inverse is np.linalg.pinv:
-            kf.update(np.array([[3.0]]), H=np.zeros((1, 2)), R=np.zeros((1, 1)))  # S = 0: its gain is 0
-        seen += [kf.x, kf.P, kf.SI]
     return seen
 
 
@@ -159,24 +53,11 @@ def make_walk(r: float) -> Any:
     return kf
 
 
-OF_WALKS = {"`IMMEstimator`": interacting_models, "`inv`": inverses}
-
-
-@pytest.mark.parametrize("use", OF_WALKS)
-def test_a_filterpy_use_gives_the_same_bits_and_with_the_random_walk_the_same_numbers(use: str) -> None:
-    expected, got = (OF_WALKS[use](partial(make_general, kind)) for kind in (Oracle, KFOPC))
+def test_the_imm_gives_the_same_bits_and_with_the_random_walk_the_same_numbers() -> None:
+    expected, got = (interacting_models(partial(make_general, kind)) for kind in (Oracle, KFOPC))
     assert same(expected, got)
-    for theirs, ours in zip(expected, OF_WALKS[use](make_walk), strict=True):
+    for theirs, ours in zip(expected, interacting_models(make_walk), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-11)
-
-
-def test_the_page_lists_these_uses() -> None:
-    page = (ROOT / "docs" / "filterpy.md").read_text(encoding="utf-8")
-    assert {row[0] for row in table_of(page, "Parts of filterpy that were compared")} == {
-        *IN_THE_MACHINE,
-        *USES,
-        *OF_WALKS,
-    }
 
 
 def test_the_imm_of_the_fork_runs_KFOPCs() -> None:

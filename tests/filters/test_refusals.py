@@ -13,36 +13,30 @@ from filterpy.kalman import KalmanFilter
 from kfopc_filterpy import KFOPC
 
 TAPS, FS = 5, 16000
-LOUDSPEAKERS, MICROPHONES, REFERENCES = 2, 3, 2  # of the filter of several, with 3 taps for each of the first and last
 ROW, EYE = np.linspace(1.0, 2.0, TAPS), np.eye(TAPS)
 STATE = ("x", "P", "x_prior", "P_prior", "x_post", "P_post", "K", "S", "SI", "y", "F", "Q", "R", "H", "M", "alpha")
 POWERS = ("rated_power", "constraint_factor", "disturbance_power", "secondary_path_gain")
 KINDS = [(kind, power) for kind in ("general", "random walk") for power in (None, 0.5)]
-SEVERAL = ("general", [0.5, 2.0])
 
 
-def make(kind: str, rated_power: Any = None) -> KFOPC:
-    """A filter after some steps; of two rated powers, one with three measurements and two references."""
+def make(kind: str, rated_power: float | None = None) -> KFOPC:
+    """A filter after some steps."""
     settings: Any = {"rated_power": rated_power, "fs": FS}
     if kind == "random walk":
         kf: KFOPC = KFOPC.random_walk(TAPS, state_noise=1e-4, measurement_noise=0.3, **settings)
-    elif isinstance(rated_power, list):
-        kf = KFOPC(LOUDSPEAKERS * REFERENCES * 3, MICROPHONES, **settings)
     else:
         kf = KFOPC(TAPS, **settings)
         kf.Q, kf.R = 1e-4 * EYE, np.array([[0.3]])
-    kf.H, kf.M = np.tile(np.linspace(1.0, 2.0, kf.dim_x), (kf.dim_z, 1)), np.zeros((kf.dim_x, kf.dim_z))
+    kf.H, kf.M = ROW.reshape(1, TAPS), np.zeros((TAPS, 1))
     run(kf, 8)
     return kf
 
 
 def run(kf: KFOPC, steps: int) -> None:
     rng = np.random.default_rng(steps)
-    several = isinstance(kf.rated_power, np.ndarray)
     for _ in range(steps):
         kf.predict()
-        z, H = rng.normal(size=kf.dim_z), rng.normal(size=(kf.dim_z, kf.dim_x))
-        kf.update(z, H=H, reference=rng.normal(size=REFERENCES) if several else rng.normal())
+        kf.update(rng.normal(), H=rng.normal(size=(1, TAPS)), reference=rng.normal())
 
 
 def require_same_course(kf: KFOPC, twin: KFOPC) -> None:
@@ -66,48 +60,35 @@ def smooth(f: KFOPC, **changed: Any) -> None:
 UPDATES = {
     'f.update("loud")': "z must be a number or an array of numbers, or None",
     "f.update(nan)": r"z must be finite.*If a value is missing, mask it",
-    "f.update(np.array([inf]))": "z must be finite",
-    "f.update([None])": "z must be a number",
     "f.update([1.0, 2.0])": r"z must have 1 value\(s\)",
     "f.update(ones((1, 1, 1)))": "z must have .* got shape",
     "f.update(1.0 + 2.0j)": "z must be real, got complex",
-    "f.update(np.array([1.0 + 0.0j]))": "z must be real, got complex",
     "f.update(1.0, reference=nan)": "reference must be finite",
     "f.update(1.0, reference=[1.0, 2.0])": "reference must be a single number",
-    'f.update(1.0, reference="x")': "reference must be a single number",
     "f.update(1.0, H=np.where(ROW > 1.5, nan, ROW), reference=1.0)": "H must be finite",
     "f.update(1.0, H=ones(6), reference=1.0)": r"H must have shape \(5,\) or \(dim_z, 5\), got \(6,\)",
-    "f.update(1.0, H=ones((5, 1)), reference=1.0)": "H must have shape",
     "f.update(1.0, H=2.0, reference=1.0)": "H must have shape",
     "f.update([1.0, 2.0, 3.0], H=ones((2, 5)))": r"z must have 2 value\(s\)",
     "f.update(1.0, R=nan, reference=1.0)": "R must be finite",
     "f.update(1.0, R=-1.0, reference=1.0)": "R must not be negative",
-    "f.update(1.0, R=[[-1.0]], reference=1.0)": "R must not be negative",
     "f.update(1.0, R=np.eye(2), reference=1.0)": "R must (have shape|be a single number)",
     "f.update(1.0, R=0.0, H=0 * ROW, reference=1.0)": "a silent reference",
     "f.update(1.0, H=1e160 * ROW, reference=1.0)": "overflow|finite square",
     "f.update(1.0, R=1e-310, H=1e-160 * ROW, reference=1.0)": "overflow",
     "f.update(1e308, R=1e-12, H=1e-3 * ROW, reference=1.0)": "overflow|finite square",
     "f.update_steadystate(nan)": "z must be finite",
-    "f.update_steadystate(1.0, reference=nan)": "reference must be finite",
     "f.update_steadystate(np.ma.masked)": "z must not be masked, except in update",
     "f.K = ones((1, 1)); f.update_steadystate(1.0)": r"K must have shape \(5, 1\)",
     "f.update_correlated(nan)": "z must be finite",
-    "f.update_correlated(1.0, reference=nan)": "reference must be finite",
-    "f.update_correlated(1.0, H=nan * ROW)": "H must be finite",
-    "f.update_correlated(1.0, R=nan)": "R must be finite",
     "f.update_correlated(1.0, H=0 * ROW, R=0.0, reference=1.0)": "a silent reference",
-    "f.update_correlated(np.ma.masked)": "z must not be masked, except in update",
     "f.M = ones((1, 1)); f.update_correlated(1.0)": r"M must have shape \(5, 1\)",
 }
 SEQUENTIAL = {
     "f.update_sequential(0, nan)": "z must be finite",
-    "f.update_sequential(0, 1.0, reference=nan)": "reference must be finite",
     "f.update_sequential(0, 1.0, H_i=nan * ROW)": "H_i must be finite",
     "f.update_sequential(0, 1.0, R_i=nan)": "R_i must be finite",
     "f.update_sequential(0, 1.0, H_i=0 * ROW, R_i=0.0)": "a silent reference",
     "f.update_sequential(0, 1e308, R_i=1e-12, H_i=1e-3 * ROW, reference=1.0)": "NaN, Inf|finite square",
-    "f.update_sequential(0, np.ma.masked)": "z must not be masked, except in update",
     "f.update_sequential(-1, 1.0)": "z_i must stay within the dim_z = 1 measurements, got 1 from start = -1 on",
     "f.update_sequential(0, [1.0, 2.0])": "z_i must stay within the dim_z = 1 measurements, got 2 from start = 0 on",
 }
@@ -115,43 +96,34 @@ OTHER_STEPS = {
     "f.predict(F=nan * EYE)": "F must be (finite|the identity)",
     "f.predict(F=np.eye(6))": r"F must (have shape|be the identity)",
     "f.predict(F=[[1.0], [1.0, 0.0]])": "F must be .*differ in length",
-    "f.predict(F=1j)": "F must be",
     "f.predict(F=1e200 * EYE)": "overflow|F must be the identity",
-    "f.predict(Q=10**400)": "Q must be",
     "f.predict(Q=-1.0)": "Q must not be negative",
     "f.predict(Q=np.eye(2))": "Q must have shape",
     "f.predict(Q=np.diag([1.0, 1, -1, 1, 1]))": "Q must not be negative",
     "f.batch_filter([None] * 2, Qs=[1.5e308] * 2)": "step 1 of the batch: .*overflow",
     "f.predict(u=nan, B=ones((5, 1)))": "u must be finite",
-    "f.predict(u=np.ma.masked_all((1, 1)), B=ones((5, 1)))": "u must be finite",
     "f.predict(u=1.0, B=np.ma.masked_all((5, 1)))": "B must be finite",
     "f.predict(u=ones((1, 1)), B=ones((6, 1)))": r"predict: .*\(shapes: .*'B': \(6, 1\)",
     "f.predict(u=ones((1, 3)), B=ones((5, 1)))": "x would become",
     "f.predict_steadystate(u=nan, B=ones((5, 1)))": "u must be finite",
-    "f.predict_steadystate(u=np.ma.masked_all((1, 1)), B=ones((5, 1)))": "u must be finite",
     "f.predict_steadystate(u=ones((2, 1)), B=ones((5, 1)))": r"predict_steadystate: .*\(shapes: .*'u': \(2, 1\)",
     "f.get_prediction(u=ones((1, 3)), B=ones((5, 1)))": "x would become",
-    "f.get_prediction(Q=ones(5))": "Q must have shape",
     "f.residual_of(np.ma.array([7.0], mask=[True]))": "z must not be masked",
     "f.residual_of([1.0, 2.0])": r"z must have 1 value\(s\)",
-    "f.get_update([1.0, 2.0])": r"z must have 1 value\(s\)",
     "f.log_likelihood_of([1.0, 2.0])": r"z must have 1 value\(s\)",
     "batch(f, zs=[1.0, 2.0, nan, 4.0])": "step 2 of the batch: z must be finite",
     "batch(f, zs=[[1.0], [2.0], [3.0, 1.0], [4.0]])": r"step 2 of the batch: z must have 1 value\(s\)",
-    "batch(f, Hs=[ROW, ROW, ROW, inf * ROW])": "step 3 of the batch: H must be finite",
     "batch(f, references=[1.0, nan, 1.0, 1.0])": "references must be finite",
     "batch(f, references=[1.0, 1.0, 1.0])": r"references must have 4 values, got shape \(3,\)",
     "batch(f, Hs=[ROW, ROW, 0 * ROW, ROW], Rs=[1.0, 1.0, 0.0, 1.0])": "step 2 of the batch: .*a silent reference",
     **{f"batch(f, {name}=[{one}] * 3)": rf"{name} must have one value for each of the 4 of zs, got 3"
        for name, one in {"Fs": "EYE", "Qs": 0.1, "Hs": "ROW", "Rs": 0.1, "us": 0.0, "Bs": "ROW"}.items()},
     "smooth(f, Xs=np.full((3, 5, 1), nan))": "Xs must be finite",
-    "smooth(f, Xs=np.ma.masked_all((3, 5, 1)))": "Xs must be finite",
     "smooth(f, Ps=[EYE] * 2)": "Xs must be .* and Ps",
     "smooth(f, Fs=EYE)": r"Fs must have shape \(3, 5, 5\)",
     "smooth(f, Qs=[EYE] * 4)": "Qs must have shape",
     "f.alpha = 1.1; smooth(f)": "alpha must be 1, got 1.1",
     "f.predict(u=1.0, B=EYE[:, :1]); f.predict(); smooth(f, us=[0.0] * 3); smooth(f)": "us= is missing: control inputs",
-    "f.predict_steadystate(1.0, EYE[:, :1]); f.predict_steadystate(); smooth(f)": "us= is missing: control inputs moved",
     "f.predict(u=1.0, B=ones((5, 1))); smooth(f, us=[0.0, None, 1.0])": "Bs= is missing: control inputs moved this",
     "smooth(f, us=[0.0])": "us and Bs must have 3 values",
     "smooth(f, us=[nan] * 3, Bs=[ones((5, 1))] * 3)": "u must be finite",
@@ -162,34 +134,15 @@ OTHER_STEPS = {
     "f.alpha = 0.5": "alpha",
     "f.constraint_factor = -0.5": "constraint_factor must not be negative",
     "f.rated_power = -1.0": "rated_power must be greater than 0",
-    'f.constraint = "tight"': "constraint must be an OutputPowerConstraint or None, got 'tight'",
+    "f.rated_power = [1.0, 2.0]": "rated_power must be a single number",
+    'f.constraint = "tight"': "constraint must be an OutputPowerConstraint or None, got 'tight'; kf_opc takes several",
 }  # fmt: skip
-OF_SEVERAL = {
-    "f.update([1.0, nan, 1.0], reference=[1.0, 1.0])": "z must be finite",
-    "f.update([1.0, 1e200, 1.0], reference=[1.0, 1.0])": "the measurement must have a finite square",
-    "f.update(ones(3))": "the secondary-path gain is unknown: pass reference=",
-    "f.update(ones(3), reference=[1.0, nan])": "reference must be finite",
-    "f.update(ones(3), reference=ones(5))": r"control filters of 2 loudspeaker\(s\) for 5 reference\(s\)",
-    "f.update(ones(2), R=np.eye(2), H=ones((2, 12)), reference=ones(2))": "needs all dim_z = 3 measurements, .* got 2",
-    "f.update(np.ma.array(ones(3), mask=[0, 1, 0]))": "a rated power needs all measurements at once: mask them all",
-    "f.batch_filter([ones((3, 1))] * 3, references=ones((2, 2)))": "references must have 3 values",
-    "f.rated_power = [1.0, 2.0, 3.0]": "each of the 2 loudspeakers",
-    "f.rated_power = [1.0, 0.0]": "rated_power must be greater than 0",
-    "f.constraint = [f.constraint[0], 2.0]": "constraint must be an OutputPowerConstraint or None",
-    "f.constraint = []": "constraint must be an OutputPowerConstraint or None",
-    "f.constraint = 5 * f.constraint": "dim_x = 12 states cannot be the control filters of 10 loudspeakers",
-}
 OF_WALKS = {
-    "f.rated_power = [1.0, 2.0]": r"this filter has one loudspeaker, .* not a sequence of 2",
-    "f.F = nan * EYE": "F must be finite",
     "f.F = np.eye(2)": "F must have shape",
-    "f.Q = -1.0": "Q must not be negative",
     "f.Q = -EYE": "Q must not be negative",
     "f.Q = np.eye(2)": "Q must have shape",
     "f.R = -1.0": "R must not be negative",
-    "f.R = [[inf]]": "R must be finite",
     "f.R = np.eye(2)": "R must have shape",
-    "f.P = nan * EYE": "P must be finite",
     "f.P = np.eye(2)": "P must have shape",
     "f.x = np.full(5, nan)": "x must be finite",
     "f.x = ones((2, 1))": r"x would become \(2, 1\), for 5 states",
@@ -204,11 +157,10 @@ OF_WALKS |= {
 BOTH = UPDATES | OTHER_STEPS | (SEQUENTIAL if hasattr(KalmanFilter, "update_sequential") else {})  # 1.4.5 has none
 CASES = [(*kind, code, says) for kind in KINDS for code, says in BOTH.items()]
 CASES += [(*kind, code, says) for kind in KINDS[2:] for code, says in OF_WALKS.items()]
-CASES += [(*SEVERAL, code, says) for code, says in OF_SEVERAL.items()]
 
 
 @pytest.mark.parametrize(("kind", "rated_power", "code", "says"), CASES)
-def test_a_fault_changes_nothing(kind: str, rated_power: Any, code: str, says: str) -> None:
+def test_a_fault_changes_nothing(kind: str, rated_power: float | None, code: str, says: str) -> None:
     kf = make(kind, rated_power)
     twin = copy.deepcopy(kf)
     scope = globals() | {"nan": math.nan, "inf": math.inf, "ones": np.ones}

@@ -249,7 +249,6 @@ ALL |= {f"{name} many": make for name, make in SEVERAL.items()} | IN_BLOCKS | AR
 FILTERS: dict[str, Any] = {
     "KFOPC": lambda: _full(rated_power=0.3, fs=FS),
     "KFOPC, plain": _full,
-    "KFOPC, loudspeakers": lambda: _full(constraint=constraints()),
     "random walk": lambda: KFOPC.random_walk(N_TAPS, **KALMAN),
     "random walk, KF-OPC": lambda: KFOPC.random_walk(N_TAPS, constraint=constraint(), **KALMAN),
 }
