@@ -83,7 +83,7 @@ def export_c(
 ) -> CExport:
     """Write a controller as a C99 source file and its header, to continue from its present state.
 
-    In a folder, an example ``main.c`` and a ``README.md`` with the calls and the cost stand beside them.
+    In a folder, an example ``main.c`` and a ``README.md`` with the calls stand beside them.
 
     The files need only ``string.h`` and ``math.h``. They allocate nothing: a struct of fixed size holds the state.
     Several controllers, each exported under its own name, link into one program. The calls are

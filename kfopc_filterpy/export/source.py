@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from ..core.block import _VIEW_PLACES, Block
 from ..core.building import FLAGS, FOLDER, stamp
-from .cost import operations, worst
 from .joined import joined, sources_of
 from .precision import REALS
 
@@ -98,8 +97,7 @@ class Exported:
 
     def examples(self) -> dict[str, str]:
         """Return an example of a program and a page about the export, by the names of the files."""
-        cost = {"operations": operations(self.block), "worst": worst(self.block)}
-        page = self.filled("example.md", **cost, dtype=self.block.algorithm.precision)
+        page = self.filled("example.md", dtype=self.block.algorithm.precision)
         return {"main.c": self.filled("example.c"), "README.md": page}
 
     def _header(self) -> dict[str, Any]:
