@@ -1,4 +1,3 @@
-from .measurement_noise import measurement_noise_from_run as measurement_noise_from_run
 from .power_constrained import ControlFilter as ControlFilter
 from .power_constrained import ControlFilters as ControlFilters
 from .power_constrained import PowerConstrainedWiener as PowerConstrainedWiener

@@ -117,7 +117,6 @@ def suggest_settings(
 
     See Also
     --------
-    measurement_noise_from_run : q alone, for a given length.
     fit_noise : noises of any filter by maximum likelihood. That is for models whose noises are real; the settings here
         are for a control filter, whose state noise r is chosen for a memory.
     wiener_solution : the best fixed filter.

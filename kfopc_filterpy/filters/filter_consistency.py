@@ -76,12 +76,8 @@ class Consistency:
 
 
 def consistency(
-    saver: Any = None,
+    saver: Any,
     *,
-    innovations: ArrayLike | None = None,
-    S: ArrayLike | None = None,
-    x: ArrayLike | None = None,
-    P: ArrayLike | None = None,
     truth: ArrayLike | None = None,
     coverage: float = 0.95,
     max_lag: int = 20,
@@ -90,15 +86,9 @@ def consistency(
 
     Parameters
     ----------
-    saver : filterpy.common.Saver or sequence of them, optional
+    saver : filterpy.common.Saver or sequence of them
         What a filter of filterpy or a `KFOPC` did, saved after each update; several are independent runs of one length. What
-        was missing, a sample whose ``z`` was None or masked components, does not count. The arrays that follow take its place.
-    innovations : array_like, shape (n_samples, dim_z) or (n_runs, n_samples, dim_z), optional
-        The filter's ``y``; masked where a measurement is missing.
-    S : array_like, shape (n_samples, dim_z, dim_z) or (n_runs, n_samples, dim_z, dim_z), optional
-        Covariances of the innovations, with all rows: those of missing measurements are not read.
-    x, P : array_like, shapes (..., n_samples, n) and (..., n_samples, n, n), optional
-        Estimates after the updates and their covariances, for the NEES; with a `saver` they are its own.
+        was missing, a sample whose ``z`` was None or masked components, does not count.
     truth : array_like, shape (n_samples, n) or (n_runs, n_samples, n), optional
         True states.
     coverage : float, default 0.95
@@ -114,8 +104,8 @@ def consistency(
     Raises
     ------
     TypeError, ValueError
-        Arrays whose shapes do not fit or that are not finite, covariances that are not positive definite, a truth
-        without estimates, a saver together with arrays, fewer samples than lags.
+        A truth whose shape does not fit or that is not finite, covariances that are not positive definite, runs of
+        different lengths, fewer samples than lags.
 
     See Also
     --------
@@ -158,37 +148,27 @@ def consistency(
     correlation of neighbouring innovations 0.29, 95 % within ±0.062: follows too slowly, Q is too small beside R
     NEES 11.2 for each state, 49 % of the samples within the 95 % bounds
     """
-    if (saver is None) == (innovations is None or S is None):
-        raise ValueError("give either a Saver, or innovations= and S=")
-    if saver is not None:
-        if not all(value is None for value in (innovations, S, x, P)):
-            raise ValueError("innovations, S, x and P are the Saver's own: leave them out, or give no Saver")
-        runs = saver if isinstance(saver, list | tuple) else [saver]
-        innovations, S, x, P = _saved(runs)
+    y, there, S, x, P = _saved(saver if isinstance(saver, list | tuple) else [saver])
     coverage, max_lag = as_number(coverage, "coverage"), as_count(max_lag, "max_lag")
     if not 0.0 < coverage < 1.0:
         raise ValueError(f"coverage must be above 0 and below 1, got {coverage:g}")
     from scipy.stats import chi2, norm
 
     tails = np.array([[0.5 - coverage / 2], [0.5 + coverage / 2]])
-    y, there = _innovations(innovations)
     n_runs, n_samples, rows = y.shape
     if n_samples <= max_lag:
         raise ValueError(f"there must be more than max_lag = {max_lag} samples, got {n_samples}; lower max_lag")
     if not there.any():
-        raise ValueError("there must be a measurement, but all innovations are masked")
+        raise ValueError("there must be a measurement, but every sample was missed")
     # An innovation that is missing has unit variance and is zero, so it adds nothing.
     both = there[..., :, np.newaxis] & there[..., np.newaxis, :]
-    whitened = _whitened(y, np.where(both, _shaped(S, (n_runs, n_samples, rows, rows), "S"), np.eye(rows)), "S")
+    whitened = _whitened(y, np.where(both, S, np.eye(rows)), "S")
     freedom = there.sum(axis=(0, 2))
     nis = np.where(freedom > 0, np.sum(whitened**2, axis=(0, 2)) / n_runs, np.nan)
     nees = nees_bounds = nees_mean = None
     if truth is not None:
-        if x is None or P is None:
-            raise ValueError("the NEES needs the estimates: give x= and P= beside truth=")
-        errors = _errors(x, truth, n_runs, n_samples)
-        n = errors.shape[2]
-        whitened_errors = _whitened(errors, _shaped(P, (n_runs, n_samples, n, n), "P"), "P")
+        n = x.shape[2]
+        whitened_errors = _whitened(_errors(x, truth), P, "P")
         nees = np.sum(whitened_errors**2, axis=(0, 2)) / n_runs
         nees_bounds, nees_mean = chi2.ppf(tails[:, 0], n_runs * n) / n_runs, float(nees.mean() / n)
     products = np.zeros(max_lag)
@@ -213,8 +193,8 @@ def consistency(
     )
 
 
-def _saved(runs: Any) -> tuple[Any, Any, Any, Any]:
-    """Return innovations, S, x and P of several Savers."""
+def _saved(runs: Any) -> tuple[np.ndarray, ...]:
+    """Return innovations, 0 where they are missing, which are there, S, x and P of several Savers."""
     if not all(hasattr(run, name) for run in runs for name in ("z", "y", "S", "x", "P")):
         raise TypeError("saver must be a filterpy.common.Saver that has saved each update, or a list of them")
     lengths = {len(run.z) for run in runs}
@@ -225,40 +205,19 @@ def _saved(runs: Any) -> tuple[Any, Any, Any, Any]:
     )
     y, x = (array.reshape(*array.shape[:2], -1) for array in (y, x))
     # filterpy saves None for a missed sample, and a `KFOPC` NaN for a missing component.
-    missing = np.isnan(z).reshape(*z.shape[:2], -1)
-    return np.ma.array(y, mask=np.broadcast_to(missing, y.shape)), S, x, P
+    there = np.broadcast_to(~np.isnan(z).reshape(*z.shape[:2], -1), y.shape)
+    return np.where(there, y, 0.0), there, S, x, P
 
 
-def _innovations(innovations: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return innovations, (n_runs, n_samples, rows), 0 where they are missing, and which are there."""
-    y, there = as_real_array(np.ma.getdata(innovations), "innovations"), ~np.ma.getmaskarray(innovations)
-    if y.ndim not in (2, 3) or not y.size:
-        raise ValueError(f"innovations must be ([n_runs,] n_samples, dim_z), got shape {y.shape}")
-    shape = y.shape if y.ndim == 3 else (1, *y.shape)
-    y = np.where(there, y, 0.0).reshape(shape)
-    require_finite(y, "innovations")
-    return y, there.reshape(shape)
-
-
-def _shaped(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Return an array with a shape, whose first axis may be left out for a single run."""
-    array = as_real_array(value, name)
-    if array.shape not in (shape, shape[1:] if shape[0] == 1 else shape):
-        raise ValueError(f"{name} must have shape {shape}, for (runs, samples, ...), got {array.shape}")
-    return array.reshape(shape)
-
-
-def _errors(x: Any, truth: Any, n_runs: int, n_samples: int) -> np.ndarray:
+def _errors(x: np.ndarray, truth: Any) -> np.ndarray:
     """Return the errors of the estimates, (n_runs, n_samples, n)."""
     states = as_real_array(truth, "truth")
-    if states.ndim < 2:
-        raise ValueError(f"truth must be ([n_runs,] n_samples, n), a column for each state, got shape {states.shape}")
-    shape = n_runs, n_samples, states.shape[-1]
-    if n_runs > 1 and states.ndim == 2:  # one truth for all runs
-        states = np.broadcast_to(states, (n_runs, *states.shape))
-    errors = _shaped(x, shape, "x") - _shaped(states, shape, "truth")
-    require_finite(errors, "x - truth")
-    return errors
+    if states.shape not in (x.shape, x.shape[1:]):
+        raise ValueError(
+            f"truth must be {x.shape}, for (runs, samples, states), or {x.shape[1:]} for all runs, got {states.shape}"
+        )
+    require_finite(states, "truth")
+    return x - states
 
 
 def _whitened(errors: np.ndarray, covariances: np.ndarray, name: str) -> np.ndarray:

@@ -121,7 +121,7 @@ class KFOPC(KalmanFilter, Checkpointed):
     array([[1.]])
     """
 
-    _in_place: ClassVar[tuple[str, ...]] = ("_constraint", "_written")  # attributes that steps write into
+    _in_place: ClassVar[tuple[str, ...]] = ("_constraint",)  # attributes that steps write into
 
     x: Any  # assigned by filterpy, like the others
     y: Any
@@ -145,7 +145,6 @@ class KFOPC(KalmanFilter, Checkpointed):
         self._settings: Any = None  # those of the next constraint: of `fs`, or of the constraint that was lifted
         self._unconstrained_factor = 1.0
         self._moved = False  # by a control input
-        self._written, self._writes = [0], 0  # steps that wrote in place, see `_require_whole`
         dim_x, dim_z = as_count(dim_x, "dim_x"), as_count(dim_z, "dim_z")
         self._row = np.zeros(dim_x)  # the last H with a rated power,
         self._equal_rows = 0  # in how many steps it has been the same, and -1 once it has changed
@@ -373,7 +372,6 @@ class KFOPC(KalmanFilter, Checkpointed):
         reference = None if reference is None else as_number(reference, "reference")
         if self._constraint is not None:
             row = np.ravel(self.H if H is None else H)
-            self._require_whole()
             self._require_random_walk(self.F)
             self._require_other_row(row)
             factor = self._constraint.preview(float(np.asarray(z).item()), row[0], reference)
@@ -384,10 +382,8 @@ class KFOPC(KalmanFilter, Checkpointed):
             else:
                 self.z[start : start + np.size(z)] = np.reshape(z, (-1, 1))
         if self._constraint is not None:
-            self._written[0] += 1
             self._constraint.accept()
             self._note_row(row)
-            self._writes += 1
 
     # The constraint: its values can be read, or supplied by the caller.
 
@@ -715,18 +711,6 @@ class KFOPC(KalmanFilter, Checkpointed):
         """Return whether a control input moves the state."""
         given = u is not None and (self.B if B is None else B) is not None
         return given and (np.ma.is_masked(u) or bool(np.any(u)))  # a masked input is refused, not left out
-
-    def _require_whole(self) -> None:
-        """Raise an error if attributes were put back without what steps write in place (`_in_place`).
-
-        A shallow copy of `__dict__` shares that with the filter. So the steps that write are counted twice: before they do
-        in a list, which the copy shares, and afterwards in a number, which it does not.
-        """
-        if self._written[0] != self._writes:
-            raise ValueError(
-                "the attributes of this filter are those of an earlier step, but not its powers and P, which steps write "
-                "in place: put back copy.deepcopy(kf.__dict__), or use copy.copy(kf)"
-            )
 
     def _snapshot(self) -> dict[str, Any]:
         """Return the attributes, with copies of what steps write in place."""

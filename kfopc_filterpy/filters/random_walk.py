@@ -161,7 +161,6 @@ class RandomWalkKFOPC(KFOPC):
             super().update(z, R, H, reference=reference)
             return
         d, noise, h = plain
-        self._require_whole()
         self._take_in_edits()
         T, x, constraint = self._triangle, self.x, self._constraint
         energy = ddot(h, h)
@@ -198,7 +197,6 @@ class RandomWalkKFOPC(KFOPC):
             raise ValueError(f"the weights would overflow: x = {x!r}, z = {d:g}, S = {S:g}. Nothing was changed")
         if not self._predicted:
             _ = self.P_prior  # of which P is another one by now: kept as it is
-        self._written[0] += 1
         if self._scale != 1.0:
             T *= self._scale
         T.reshape(-1)[:: self.dim_x + 1] += diagonal
@@ -213,7 +211,6 @@ class RandomWalkKFOPC(KFOPC):
         self._gain, self._last = K, (d, y, S)
         self.__dict__["x"], self.x_post = weights, weights.copy()
         self._log_likelihood = self._likelihood = self._mahalanobis = None
-        self._writes += 1
 
     def _plain(self, z: Any, R: Any, H: Any) -> tuple[float, float, np.ndarray] | None:
         """Return z, R and H as numbers and (n,); None for a missed sample, several rows of H or another `inv`."""
@@ -234,7 +231,6 @@ class RandomWalkKFOPC(KFOPC):
 
     def _full(self, scale: float, diagonal: float) -> np.ndarray:
         """Return scale T + diagonal I as a full symmetric array."""
-        self._require_whole()
         P = np.tril(self._triangle)
         P += np.tril(P, -1).T
         P *= scale

@@ -43,10 +43,17 @@ def plot_consistency(result: Consistency, *, ax: Sequence[Axes] | None = None) -
     --------
     >>> import matplotlib.pyplot as plt
     >>> import numpy as np
+    >>> from filterpy.common import Saver
+    >>> from kfopc_filterpy import KFOPC
     >>> from kfopc_filterpy.filters import consistency
     >>> from kfopc_filterpy.plot import plot_consistency
-    >>> y = np.random.default_rng(0).standard_normal((200, 1))
-    >>> axes = plot_consistency(consistency(innovations=y, S=np.ones((200, 1, 1))))
+    >>> kf = KFOPC(dim_x=1)
+    >>> saver = Saver(kf)
+    >>> for z in np.random.default_rng(0).standard_normal(200):
+    ...     kf.predict()
+    ...     kf.update(z)
+    ...     saver.save()
+    >>> axes = plot_consistency(consistency(saver))
     >>> [ax.get_ylabel() for ax in axes]
     ['NIS', 'Correlation']
     >>> plt.close(axes[0].figure)

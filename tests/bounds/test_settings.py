@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.channels import dense_systems
+from helpers.channels import delayed, dense_systems
 from helpers.settings_grid import FS, NOISES, ON, compare, noisy_scene, silent_run
 
 from comparisons.bench.noises import bursty_noise
 from comparisons.studies.cases import modelled_plants
 from kfopc_filterpy import Plant, kf_anc, simulate, suggest_settings
-from kfopc_filterpy.bounds import measurement_noise_from_run, settings
+from kfopc_filterpy.bounds import settings
 from kfopc_filterpy.signals import tone
 
 S = np.array([0.0, 0.0, 0.8, 0.3])
@@ -78,7 +78,10 @@ def long_tail():
 def test_the_noises_and_the_variance_are_those_of_the_formulas():
     suggested = suggest_settings(X, PLANT, disturbance=D, n_taps=24, memory_s=0.5)
     filtered = np.convolve(X, S)[: X.size]
-    q = measurement_noise_from_run(X, PLANT, n_taps=24, disturbance=D)
+    start = 24 + S.size - 2  # delay lines full
+    rows = delayed(filtered[None], 24)[:, start:].T
+    _, (squares,), _, _ = np.linalg.lstsq(rows, D[start:], rcond=None)
+    q = squares / (len(rows) - 24)
     assert suggested.n_taps == 24
     assert suggested.measurement_noise == pytest.approx(q, rel=1e-6)  # but for the ridge of 1e-11
     # mean squares over the samples with full delay lines, or over all: 0.2 % of the record
@@ -86,6 +89,19 @@ def test_the_noises_and_the_variance_are_those_of_the_formulas():
     memory = np.sqrt(q / (suggested.state_noise * np.mean(filtered**2))) / FS
     assert memory == pytest.approx(0.5, rel=0.02)  # white noise: its power over 10 ms varies by 160 samples' chance
     assert memory > 0.5
+
+
+def test_q_has_no_bias_from_the_weights_fitted():
+    """27 weights on 300 samples take a tenth of the residual: 160 estimates average to q within 4 sigma."""
+    estimates = []
+    for seed in range(160):
+        rng = np.random.default_rng(seed)
+        x, w = rng.standard_normal(300), rng.standard_normal(27)
+        d = np.convolve(np.convolve(x, S), w)[:300] + np.sqrt(0.5) * rng.standard_normal(300)
+        estimates.append(suggest_settings(x, PLANT, disturbance=d, n_taps=27).measurement_noise)
+    sigma = np.sqrt(2 / (300 - 29 - 27) / len(estimates))
+    assert np.mean(estimates) == pytest.approx(0.5, rel=4 * sigma)
+    assert 4 * sigma < 27 / 300 / 2  # an uncorrected mean square would be far outside
 
 
 def test_a_short_memory_makes_a_long_filter_not_worth_while():

@@ -151,27 +151,6 @@ def test_within_a_rated_power_kf_pb_reaches_the_bound_and_kf_opc_its_scaled_filt
     assert error == pytest.approx(left_by(alpha * KEPT / GAIN), abs=SCATTER)
 
 
-def test_hybrid_control_does_better_than_either(disturbance: np.ndarray) -> None:
-    """The microphone hears a white source in time, and the AR(1) noise is heard by nobody before."""
-    white = np.random.default_rng(5).standard_normal(disturbance.size)
-    d = disturbance + np.roll(white, DELAY + 2)
-    path = PURE_DELAY[None, None]
-    noise = {"state_noise": 1e-12, "measurement_noise": 0.3}
-    both = simulate(
-        with_internal_model(kf_anc(8, path, n_references=2, **noise)),
-        white[None],
-        Plant(path, fs=FS),
-        disturbance=d[None],
-    )
-    forward = simulate(kf_anc(8, PURE_DELAY, **noise), white, Plant(PURE_DELAY, fs=FS), disturbance=d)
-    feedback = simulate(
-        with_internal_model(kf_anc(8, PURE_DELAY, **noise)), None, Plant(PURE_DELAY, fs=FS), disturbance=d
-    )
-    powers = [np.mean(one.error[..., d.size // 2 :] ** 2) for one in (both, forward, feedback)]
-    assert powers[0] < 0.8 * min(powers[1:])
-    assert powers[1] == pytest.approx(1.0, abs=0.1)  # the AR(1) noise
-
-
 # Samples that do not arrive.
 
 

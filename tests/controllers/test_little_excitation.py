@@ -61,13 +61,6 @@ def test_what_forgets_forgets_only_what_is_replaced(name: str, passage: str) -> 
     require_no_trace(name, passage, 500_000)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("passage", ["silence", "tone", "constant"])
-@pytest.mark.parametrize("name", FORGET)
-def test_so_it_is_after_an_hour(name: str, passage: str) -> None:
-    require_no_trace(name, passage, 3600 * round(FS))
-
-
 @pytest.mark.parametrize("name", [*FORGET, "frequency domain"])
 def test_what_decays_in_silence_ends_at_zero(name: str) -> None:
     """Denormal numbers made leaky FxLMS four times slower there."""

@@ -1,23 +1,18 @@
-"""The LMS family against what each must settle to, its limits; several channels against one, and what they refuse."""
+"""The LMS family against what each must settle to, and the limits of its steps."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import control
 import numpy as np
 import pytest
 import scipy.linalg
 import scipy.optimize
-from helpers.channels import random_paths
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kfopc_filterpy import (
-    OutputPowerConstraint,
     Plant,
-    clipping_fx_lms,
-    fx_lms,
     fx_nlms,
     leaky_fx_lms,
     mov_fx_lms,
@@ -29,38 +24,8 @@ from kfopc_filterpy import (
 )
 from kfopc_filterpy.controllers import penalty_factor
 
-L = 5
+L, FS = 5, 16000.0
 PATH = np.array([0.0, 0.8, -0.3, 0.1])  # true secondary path
-ESTIMATE = np.array([0.0, 0.7, -0.25])  # what the controllers know of it
-MU = 0.02
-
-
-def noise(n: int = 400, seed: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    x, other = np.random.default_rng(seed).standard_normal((2, n))
-    return x, np.convolve(x, [0.0, 0.0, 1.2, 0.5])[:n] + 0.1 * other
-
-
-AMPLITUDE = {
-    "two-gradient FxLMS": two_gradient_fx_lms,
-    "re-scaling FxLMS": rescaling_fx_lms,
-    "clipping FxLMS": clipping_fx_lms,
-}
-
-
-@pytest.mark.parametrize("switch_on_s", [0.0, 0.1])
-def test_rules_that_do_not_act_are_fxlms(switch_on_s: float) -> None:
-    x, d = noise()
-    options: Any = {"plant": Plant(PATH, fs=1000), "disturbance": d, "switch_on_s": switch_on_s}
-    plain = simulate(fx_lms(L, ESTIMATE, step_size=MU), x, **options)
-    rated: Any = {"constraint": OutputPowerConstraint(1e6, fs=1000)}
-    for controller in (
-        leaky_fx_lms(L, ESTIMATE, step_size=MU, leak=0.0),
-        optimal_leaky_fx_lms(L, ESTIMATE, step_size=MU, **rated),
-        mov_fx_lms(L, ESTIMATE, step_size=MU, **rated),
-        mov_fx_lms(L, ESTIMATE, step_size=MU, penalty_factor=0.0, **rated),
-        *(kind(L, ESTIMATE, step_size=MU, amplitude_limit=1e3) for kind in AMPLITUDE.values()),
-    ):
-        np.testing.assert_array_equal(simulate(controller, x, **options).error, plain.error, err_msg=controller.name)
 
 
 # ---- What they settle to
@@ -120,11 +85,6 @@ def test_a_white_reference_through_a_flat_path_is_held_to_the_rated_power(kind: 
     assert made.weights[1] == pytest.approx(2.0, rel=0.03)  # half of 4
 
 
-def test_penalty_by_hand() -> None:
-    assert penalty_factor(1.0, disturbance_power=4.0, secondary_path_gain=0.25) == pytest.approx(1.0 - 0.25, rel=1e-15)
-    assert penalty_factor(20.0, disturbance_power=4.0, secondary_path_gain=0.25) == 0.0  # 16 would do
-
-
 @given(st.floats(1e-6, 1e6), st.floats(1e-6, 1e6), st.floats(1e-6, 1e6))
 def test_the_penalty_leaves_the_constraint_factor(rated: float, power: float, gain: float) -> None:
     """G_s / (G_s + gamma) = min(sqrt(rho_o G_s / delta_d^2), 1), eq. 13."""
@@ -133,16 +93,6 @@ def test_the_penalty_leaves_the_constraint_factor(rated: float, power: float, ga
 
 
 # ---- Amplitude limits
-
-
-@pytest.mark.parametrize("name", ["re-scaling FxLMS", "clipping FxLMS"])
-@settings(max_examples=30, deadline=None)
-@given(seed=st.integers(0, 10**6), level=st.floats(0.01, 1e3), limit=st.floats(1e-3, 10.0))
-def test_the_amplitude_is_never_above_its_limit(name: str, seed: int, level: float, limit: float) -> None:
-    x, d = noise(100, seed)
-    controller = AMPLITUDE[name](L, ESTIMATE, step_size=0.01, amplitude_limit=limit)
-    result = simulate(controller, x, Plant(PATH, fs=FS), disturbance=level * d)
-    assert np.nanmax(np.abs(result.control_signal)) <= limit
 
 
 def test_re_scaling_holds_a_tone_to_its_rated_power() -> None:
@@ -179,70 +129,21 @@ def test_two_gradients_settle_where_they_balance(ratio: float) -> None:
     assert amplitude == pytest.approx(expected, rel=0.02)
 
 
-# ---- Several channels
-
-
-K, J, I = 3, 2, 2  # microphones, loudspeakers, references  # noqa: E741
-FS = 16000.0
-PATHS = 0.7 * random_paths(K, J, 6, seed=5)  # true secondary paths
-ESTIMATES = 0.9 * PATHS[:, :, :4]  # what the controllers know of them
-PRIMARY = random_paths(K, I, 7, seed=6)
-
-
-def noises(n: int = 400, n_references: int = I) -> np.ndarray:
-    return np.random.default_rng(3).standard_normal((n_references, n))
-
-
-def fxlms(path: Any = ESTIMATES) -> Any:
-    return fx_lms(L, path, step_size=0.01, n_references=I)
-
-
-def run(controller: Any, x: np.ndarray) -> Any:
-    return simulate(controller, x, Plant(PATHS, PRIMARY, fs=FS))
+# ---- Steps
 
 
 def test_a_normalised_step_does_not_depend_on_the_level_and_is_stable_up_to_2() -> None:
     """On paths without delay, where the error power cannot grow within a step that is below 2, and does above."""
-    flat = np.random.default_rng(8).standard_normal((K, J, 1)) * np.eye(1, 3)
-    x, level = noises(3000), np.repeat([1.0, 30.0], 1500)
+    flat = np.random.default_rng(8).standard_normal((3, 2, 1)) * np.eye(1, 3)
+    x, level = np.random.default_rng(3).standard_normal((2, 3000)), np.repeat([1.0, 30.0], 1500)
     d = np.einsum("kj,ji,in->kn", flat[:, :, 0], [[0.5, 0.2], [-0.3, 0.4]], x)
     errors = []
     for mu in (0.5, 1.9, 2.5):
-        controller = fx_nlms(1, flat, step_size=mu, n_references=I)
+        controller = fx_nlms(1, flat, step_size=mu, n_references=2)
         errors.append(simulate(controller, level * x, Plant(flat, fs=FS), disturbance=level * d).error)
     for error in errors[:2]:
         assert np.mean(error[:, -200:] ** 2) < 1e-6 * np.mean(d[:, -200:] ** 2)  # loud or soft
     assert np.nanmax(np.abs(errors[2])) > 10.0 * np.abs(level * d).max()
-
-
-def test_every_loudspeaker_keeps_its_rated_power() -> None:
-    """MOV-FxLMS counts on each loudspeaker alone: what they need together is less."""
-    x = noises(40_000)
-    free = run(fx_lms(L, PATHS, step_size=2e-3, n_references=I), x)
-    wanted = output_power(free.control_signal[:, 20_000:])
-    rated = 0.25 * wanted
-    assert np.all(wanted > 2.0 * rated)
-    result = run(mov_fx_lms(L, PATHS, step_size=2e-3, rated_power=rated, fs=FS, n_references=I), x)
-    powers = output_power(result.control_signal[:, 20_000:])
-    assert np.all(powers < rated)
-    assert np.all(powers > 0.05 * rated)
-    assert result.rated_power.tolist() == rated.tolist()
-    factor = result.constraint_factor
-    assert factor.shape == (J, 40_000)
-    assert np.all(factor[:, 20_000:] < 1.0)
-    assert factor[0, -1] != factor[1, -1]
-
-
-# ---- Odd systems
-
-
-def test_a_matrix_of_systems_is_a_secondary_path() -> None:
-    systems = [[control.TransferFunction(row, [1.0, 0.0, 0.0, 0.0], 1 / FS) for row in rows] for rows in ESTIMATES]
-    controller = fxlms(systems)
-    got, want = run(controller, noises(100)), run(fxlms(), noises(100))
-    np.testing.assert_allclose(got.error, want.error, rtol=0, atol=1e-12)
-    with pytest.raises(ValueError, match="fs is 500 Hz but the controller's secondary path is for 16000 Hz"):
-        simulate(controller, noises(100), Plant(PATHS, PRIMARY, fs=500.0))
 
 
 def test_a_large_leak_forgets_everything_and_no_more() -> None:
@@ -268,13 +169,3 @@ def test_weights_that_were_learned_of_hardly_anything_begin_anew() -> None:
         assert before[0] > 1.0
         made.control_signal(louder * 1e-3)
         np.testing.assert_array_equal(made.weights, [0.0] if forgets else before)
-
-
-def test_a_leak_may_be_above_one() -> None:
-    """It is in the unit of the filtered reference's power: w = (1 - mu gamma) w + mu e x'."""
-    made, w = leaky_fx_lms(1, [1.0], step_size=0.05, leak=10.0), 0.0
-    for error in (4.0, 5.0, -6.0):
-        made.control_signal(1.0)
-        made.update(error)
-        w = 0.5 * w + 0.05 * error
-    np.testing.assert_allclose(made.weights, [w], rtol=1e-12)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -128,24 +131,6 @@ def test_samples_that_were_missed_do_not_count():
     assert result.nees is None
 
 
-def test_arrays_are_the_same_as_a_saver_and_a_mask_leaves_rows_out():
-    saver, truth = tracked(np.random.default_rng(3), 50)
-    y, S, x, P = (np.array(getattr(saver, name)) for name in ("y", "S", "x", "P"))
-    of_saver = consistency(saver, truth=truth)
-    of_arrays = consistency(innovations=y[:, :, 0], S=S, x=x[:, :, 0], P=P, truth=truth)
-    assert np.array_equal(of_saver.nis, of_arrays.nis)
-    assert np.array_equal(of_saver.nees, of_arrays.nees)
-    masked = np.ma.array(y[:, :, 0])
-    masked[7, 0] = np.ma.masked
-    masked[9] = np.ma.masked
-    S[7, 0], S[7, :, 0], S[9] = np.nan, np.nan, np.nan  # not read
-    result = consistency(innovations=masked, S=S)
-    assert_allclose(result.nis[7], y[7, 1, 0] ** 2 / S[7, 1, 1])
-    assert_allclose(result.nis_bounds[:, 7], chi2.ppf([0.025, 0.975], 1))
-    assert np.isnan(result.nis[9])
-    assert_allclose(result.nis[8], of_saver.nis[8])
-
-
 def test_a_saver_of_a_filter_that_took_some_components_counts_those():
     kf = KFOPC(dim_x=2, dim_z=2)
     kf.F, kf.H, kf.Q, kf.R = F, H, Q, R
@@ -160,30 +145,29 @@ def test_a_saver_of_a_filter_that_took_some_components_counts_those():
     assert_allclose(result.autocorrelation_bounds, 1.959963984540054)  # one pair: the second component at first
 
 
-WHITE = {"innovations": np.ones((30, 1)), "S": np.ones((30, 1, 1))}
+SAVER, TRUTH = tracked(np.random.default_rng(0), 30)
+
+
+def saved(**other: Any) -> SimpleNamespace:
+    return SimpleNamespace(**dict.fromkeys(("z", "y", "S", "x", "P"), np.ones((30, 1, 1))) | other)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error", "message"),
+    ("saver", "arguments", "error", "message"),
     [
-        ({}, ValueError, "give either a Saver, or innovations= and S="),
-        ({"saver": 3}, TypeError, "saver must be a filterpy.common.Saver that has saved"),
-        ({"saver": Saver(KalmanFilter(1, 1)), "x": 1}, ValueError, "the Saver's own"),
-        ({"saver": [tracked(np.random.default_rng(0), n)[0] for n in (4, 5)]}, ValueError, "equally many samples"),
-        ({**WHITE, "innovations": np.ones(30)}, ValueError, r"innovations must be .* got shape \(30,\)"),
-        ({**WHITE, "S": np.ones((30, 1))}, ValueError, r"S must have shape \(1, 30, 1, 1\)"),
-        ({**WHITE, "S": np.zeros((30, 1, 1))}, ValueError, "S must hold positive definite matrices"),
-        ({**WHITE, "innovations": np.ma.masked_all((30, 1))}, ValueError, "all innovations are masked"),
-        ({**WHITE, "coverage": 1.0}, ValueError, "coverage must be above 0 and below 1, got 1"),
-        ({**WHITE, "max_lag": 30}, ValueError, "more than max_lag = 30 samples, got 30; lower max_lag"),
-        ({**WHITE, "truth": np.ones((30, 1))}, ValueError, "give x= and P= beside truth="),
-        ({**WHITE, "truth": np.ones(30), "x": 1, "P": 1}, ValueError, "a column for each state"),
-        ({**WHITE, "truth": np.ones((30, 1)), "x": np.ones((30, 2)), "P": WHITE["S"]}, ValueError, "x must have"),
+        (3, {}, TypeError, "saver must be a filterpy.common.Saver that has saved"),
+        ([tracked(np.random.default_rng(0), n)[0] for n in (4, 5)], {}, ValueError, "equally many samples"),
+        (saved(S=np.zeros((30, 1, 1))), {}, ValueError, "S must hold positive definite matrices"),
+        (saved(z=np.full((30, 1, 1), np.nan)), {}, ValueError, "every sample was missed"),
+        (SAVER, {"coverage": 1.0}, ValueError, "coverage must be above 0 and below 1, got 1"),
+        (SAVER, {"max_lag": 30}, ValueError, "more than max_lag = 30 samples, got 30; lower max_lag"),
+        (SAVER, {"truth": TRUTH[:, 0]}, ValueError, r"truth must be \(1, 30, 2\)"),
+        (SAVER, {"truth": np.nan * TRUTH}, ValueError, "truth must be finite"),
     ],
 )
-def test_what_cannot_be_tested_is_refused(arguments, error, message):
+def test_what_cannot_be_tested_is_refused(saver, arguments, error, message):
     with pytest.raises(error, match=message):
-        consistency(**arguments)
+        consistency(saver, **arguments)
 
 
 def test_the_figure_shows_the_values_and_their_bounds():

@@ -267,34 +267,6 @@ def test_any_covariance_is_accepted(name: str) -> None:
     np.testing.assert_allclose(filters[2].x, filters[0].x, rtol=1e-9)
 
 
-# Attributes that a user saves and puts back.
-
-
-@pytest.mark.parametrize(("kind", "rated_power"), [("general", 0.5), ("random walk", None), ("random walk", 0.5)])
-def test_a_shallow_copy_of_the_attributes_is_refused_and_a_deep_one_is_the_filter(kind: str, rated_power: Any) -> None:
-    """Steps write into the powers and into a random walk's P, which a shallow copy shares with the filter."""
-    kf = make(kind, rated_power)
-    twin = copy.deepcopy(kf)
-    shallow, deep = dict(vars(kf)), copy.deepcopy(vars(kf))
-    vars(kf).update(shallow)  # nothing was written since
-    require_same_course(kf, twin)
-    vars(kf).update(shallow)
-    with pytest.raises(ValueError, match=r"those of an earlier step.*put back copy\.deepcopy\(kf\.__dict__\)"):
-        kf.update(1.0, H=ROW, reference=1.0)
-    vars(kf).clear()
-    vars(kf).update(deep)
-    again = make(kind, rated_power)
-    require_same_course(kf, again)
-
-
-def test_a_general_filter_without_a_rated_power_goes_on_from_a_shallow_copy() -> None:
-    kf, twin = make("general"), make("general")
-    shallow = dict(vars(kf))
-    run(kf, 3)
-    vars(kf).update(shallow)
-    require_same_course(kf, twin)
-
-
 # Arguments of other kinds.
 
 
