@@ -7,7 +7,6 @@ import pytest
 from helpers.channels import constrained_filters, dense_systems, random_paths, through
 
 from kfopc_filterpy import Plant, power_constrained_wiener
-from kfopc_filterpy.paths.least_squares import correlation_matrix
 
 FS, K, J, REFERENCES, TAPS = 1000.0, 3, 2, 2, 10
 SECONDARY = random_paths(K, J, 7, seed=0)
@@ -19,12 +18,6 @@ def signals(n_samples: int = 3000) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(2)
     x = np.array([np.convolve(row, [1.0, 0.7], "same") for row in rng.standard_normal((REFERENCES, n_samples))])
     return x, through(PRIMARY, x) + 0.1 * rng.standard_normal((K, n_samples))
-
-
-def test_block_correlations_are_sums_over_delayed_signals() -> None:
-    x = np.random.default_rng(3).standard_normal((3, 60))
-    rows = np.array([s[TAPS - 1 - m : 60 - m] for s in x for m in range(TAPS)])
-    np.testing.assert_allclose(correlation_matrix(x, TAPS), rows @ rows.T / rows.shape[1], atol=1e-13)
 
 
 def test_the_bound_meets_dense_solves_and_every_budget() -> None:

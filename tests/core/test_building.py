@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
-import platform
 import re
 import shutil
 import subprocess
@@ -83,18 +81,6 @@ def test_a_library_that_cannot_be_used_is_reported(change: Callable[[Path], None
     message = only_line(loaded(copied))
     assert says in message
     assert "python -m pip install -e ." in message
-
-
-def test_only_the_library_that_is_loaded_need_be_current(copied: Path) -> None:
-    """An old one of another level is refused where it is asked for."""
-    higher = sorted(copied.glob("libanc-double-x86-64-*"))
-    if not higher or library.load().level == "baseline":
-        pytest.skip("only the baseline is built, or this processor has no more")
-    for path in higher:
-        shutil.copy(library.load().path, path)
-        path.write_bytes(path.read_bytes().replace(building.stamp().encode(), b"0" * 16))
-    assert "was built from other sources" in only_line(loaded(copied))
-    assert loaded(copied, KFOPC_CORE_LEVEL="baseline").stdout.strip() == "baseline"
 
 
 @pytest.mark.parametrize("level", building.levels())
@@ -177,30 +163,6 @@ def test_instructions_of_the_environment_reach_no_library(no_flags: pytest.Monke
     assert "AVX" not in own
 
 
-@pytest.mark.parametrize("processor", ["x86-64", "x86-64-v4", "sapphirerapids"])
-def test_headers_take_the_flags_of_strangers(processor: str, tmp_path: Path) -> None:
-    """Without -std, a processor that has half precision says so in FLT_EVAL_METHOD, which changes no double."""
-    command = c_compiler()
-    if platform.machine() not in ("x86_64", "AMD64"):
-        pytest.skip("these are processors of another kind")
-    unit = tmp_path / "unit.c"
-    unit.write_text('#include "signals.h"\nextern int something;\n')
-    unused = ("-Wno-unused-function", "-Wno-unused-const-variable")
-    ran(
-        *command,
-        "-O3",
-        f"-march={processor}",
-        "-Wundef",
-        *WARNINGS,
-        *unused,
-        f"-I{building.FOLDER}",
-        "-c",
-        unit,
-        "-o",
-        os.devnull,
-    )
-
-
 @pytest.mark.parametrize("flag", ["-ffast-math", "-Ofast"])
 def test_headers_refuse_fast_mathematics(flag: str, tmp_path: Path) -> None:
     """Whoever compiles the C files with his own tools is told too."""
@@ -247,17 +209,6 @@ def test_zig_is_taken_where_the_machine_has_no_compiler(tmp_path: Path, no_flags
     no_flags.setenv("PATH", str(tmp_path))
     no_flags.setattr(building.importlib.util, "find_spec", lambda name: object())
     assert building.compiler() == [sys.executable, "-P", "-m", "ziglang", "cc"]
-
-
-def test_only_zig_builds_for_other_machines(tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
-    no_flags.setenv("CC", "gcc")
-    no_flags.setattr(building.importlib.util, "find_spec", lambda name: object())
-    command, target = [sys.executable, "-P", "-m", "ziglang", "cc"], "aarch64-linux-musl"
-    assert building.compiler(target) == command
-    assert {"-mcpu=baseline", "-target", target} <= set(building.flags(command, target=target))
-    no_flags.setattr(building.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(building.BuildError, match="only zig builds for other machines"):
-        building.build(building.core_sources(), tmp_path / "lib.so", target=target)
 
 
 @pytest.mark.parametrize("real", building.REALS)

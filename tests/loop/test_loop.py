@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 from helpers.comparing import SIGNALS, assert_same_run
+from helpers.controllers import MAKERS
 from helpers.loop import FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R, S, noises, run
 from helpers.simulation import Stepwise
 from hypothesis import given, settings
@@ -15,25 +16,11 @@ from kfopc_filterpy import (
     KalmanController,
     OutputPowerConstraint,
     Plant,
-    fx_lms,
-    kf_anc,
     kf_opc,
     mov_fx_lms,
     simulate,
 )
 from kfopc_filterpy.loop.simulation import STRETCH
-
-
-def controller(name, *, rated_power=0.3):
-    kalman = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
-    constraint = OutputPowerConstraint(rated_power, fs=FS, memory_s=MEMORY_S)
-    if name == "KF-ANC":
-        return kf_anc(N_TAPS, S_HAT, **kalman)
-    if name == "KF-OPC":
-        return kf_opc(N_TAPS, S_HAT, constraint=constraint, **kalman)
-    if name == "FxLMS":
-        return fx_lms(N_TAPS, S_HAT, step_size=MU)
-    return mov_fx_lms(N_TAPS, S_HAT, step_size=MU, constraint=constraint)
 
 
 @pytest.mark.parametrize(("own", "rated_power"), [("filterpy", None), ("KFOPC", None), ("KFOPC", 0.3)])
@@ -46,7 +33,7 @@ def test_any_filterpy_filter_runs_in_the_loop(own, rated_power):
     else:
         estimator = KalmanFilter(dim_x=N_TAPS, dim_z=1)
     estimator.Q, estimator.R, estimator.P = R * np.eye(N_TAPS), np.array([[Q]]), P0 * np.eye(N_TAPS)
-    generic, fast = run(KalmanController(estimator, S_HAT)), run(controller(name))
+    generic, fast = run(KalmanController(estimator, S_HAT)), run(MAKERS[name]())
     assert generic.algorithm == name
     for signal in SIGNALS:
         want = getattr(fast, signal)
@@ -57,13 +44,13 @@ def test_any_filterpy_filter_runs_in_the_loop(own, rated_power):
 # ---- One definition of the equations, two ways to run them
 
 
-@pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
+@pytest.mark.parametrize("name", ["KF-OPC", "MOV"])
 def test_pieces_of_the_compiled_loop_do_not_show(name):
     """Progress comes after each; the steps have none."""
     n, done = 2 * STRETCH + 7, []
-    whole = run(controller(name), n=n, progress=done.append)
+    whole = run(MAKERS[name](), n=n, progress=done.append)
     assert done == [STRETCH, STRETCH, 7]
-    assert_same_run(whole, run(Stepwise(controller(name)), n=n))
+    assert_same_run(whole, run(Stepwise(MAKERS[name]()), n=n))
 
 
 # ---- What must hold for any signal
@@ -71,7 +58,7 @@ def test_pieces_of_the_compiled_loop_do_not_show(name):
 
 @given(exponent=st.integers(-20, 20), seed=st.integers(0, 1000))
 @settings(max_examples=25)
-@pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
+@pytest.mark.parametrize("name", ["KF-OPC", "MOV"])
 def test_scaled_noise_and_rated_power_scale_the_control(name, exponent, seed):
     """x, d by c, rated power, q, and 1/mu by c^2: the weights stay and y, e, y_amp grow by c (exactly: c = 2^k)."""
     x, d, _ = noises(200, seed)
@@ -96,8 +83,10 @@ def test_scaled_noise_and_rated_power_scale_the_control(name, exponent, seed):
 def test_with_rated_power_to_spare_the_constrained_are_the_unconstrained(seed, rated_power):
     x, d, _ = noises(200, seed)
     plant = Plant(S, fs=FS)
-    for names in (("KF-OPC", "KF-ANC"), ("MOV-FxLMS", "FxLMS")):
-        one, other = (simulate(controller(name, rated_power=rated_power), x, plant, disturbance=d) for name in names)
+    for names in (("KF-OPC", "KF-ANC"), ("MOV", "FxLMS")):
+        made, other_made = (MAKERS[name]() for name in names)
+        made.rated_power = rated_power
+        one, other = (simulate(each, x, plant, disturbance=d) for each in (made, other_made))
         np.testing.assert_array_equal(one.constraint_factor, 1.0)
         np.testing.assert_array_equal(one.control_signal, other.control_signal)
         np.testing.assert_array_equal(one.error, other.error)

@@ -2,7 +2,6 @@
 
 import copy
 import math
-import threading
 
 import numpy as np
 import pytest
@@ -149,36 +148,6 @@ def test_plants_that_do_not_allow_to_share(shared, plant):
     results = simulate(made, x, plant, disturbance=own["disturbance"][0])
     assert shared == []
     assert_as_alone(results, [simulate(c, x, plant, disturbance=own["disturbance"][0]) for c in alone], made, alone)
-
-
-def test_progress_counts_the_samples_of_all_runs():
-    x, plants, own = differing(9, STRETCH + 7)
-    counts = []
-    simulate([*filters(8), fx_lms(7, S_HAT, step_size=0.01)], x, plants, progress=counts.append, **own)
-    assert counts == [8 * STRETCH, 8 * 7, STRETCH, 7]
-
-
-def test_no_other_thread_uses_a_controller_meanwhile():
-    """Its state is given back at the end, so a step in between would be lost."""
-    x, plants, own = differing(3, STRETCH + 7)
-    made, refused = filters(3), []
-
-    def use(controller):
-        try:
-            controller.control_signal(1.0)
-        except RuntimeError as error:
-            refused.append(str(error))
-
-    def progress(_):
-        for controller in made:
-            thread = threading.Thread(target=use, args=(controller,))
-            thread.start()
-            thread.join()
-
-    simulate(made, x, plants, progress=progress, **own)
-    assert len(refused) == 2 * 3
-    assert "in use by another thread" in refused[0]
-    assert made[0].control_signal(1.0) != 0.0  # and free again
 
 
 def test_an_interrupted_run_leaves_the_controllers_as_they_were():

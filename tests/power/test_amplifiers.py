@@ -80,13 +80,6 @@ def test_refuses_limits_and_sharpnesses(bad, error):
         SoftSaturationAmplifier(1.0, bad)
 
 
-def test_models_are_values():
-    assert SoftSaturationAmplifier(1) == SoftSaturationAmplifier(1.0, 2.0)
-    assert type(HardClipAmplifier(np.float32(1)).limit) is float
-    with pytest.raises(AttributeError, match="cannot assign"):
-        HardClipAmplifier(1.0).limit = 2.0
-
-
 def test_models_of_the_compiled_loop():
     np.testing.assert_array_equal(compiled_model(None), LinearAmplifier().model)
     assert compiled_model(HardClipAmplifier(2.0))["limit"][0] == 2.0

@@ -88,24 +88,19 @@ def adversary(parts: list, rated_power: float, seed: int) -> np.ndarray:
     return np.concatenate(signal)
 
 
-@given(pieces, windows, powers, st.integers(0, 10**6))
-@example([("constant", 120, 0.0)] * 5, 64, 1.0, 0)
-@example([("alternating", 120, 0.0), ("spike", 3, 150.0), ("constant", 120, 0.001)] * 3, 7, 1e-300, 0)
-def test_no_window_is_ever_above_the_rated_power(parts: list, samples: int, rated_power: float, seed: int) -> None:
+@given(pieces, windows, powers, st.none() | st.floats(-3.0, 3.0), st.integers(0, 10**6))
+@example([("constant", 120, 0.0)] * 5, 64, 1.0, None, 0)
+@example([("alternating", 120, 0.0), ("spike", 3, 150.0), ("constant", 120, 0.001)] * 3, 7, 1e-300, None, 0)
+def test_no_window_is_ever_above_the_rated_power_and_no_sample_above_the_amplitude_limit(
+    parts: list, samples: int, rated_power: float, decade: float | None, seed: int
+) -> None:
     u = adversary(parts, rated_power, seed)
-    y = limiter(samples, rated_power).process(u)
+    limit = None if decade is None else math.sqrt(rated_power) * 10.0**decade
+    y = limiter(samples, rated_power, limit).process(u)
     assert np.all(np.isfinite(y))
     assert first_window_over(y, samples, rated_power) is None
     assert np.all(y * np.sign(u) >= 0)  # scaled, never turned or amplified
-    assert np.all(np.abs(y) <= np.abs(u))
-
-
-@given(pieces, windows, powers, st.floats(-3.0, 3.0), st.integers(0, 10**6))
-def test_both_limits_at_once(parts: list, samples: int, rated_power: float, decade: float, seed: int) -> None:
-    limit = math.sqrt(rated_power) * 10.0**decade
-    y = limiter(samples, rated_power, limit).process(adversary(parts, rated_power, seed))
-    assert np.max(np.abs(y)) <= limit
-    assert first_window_over(y, samples, rated_power) is None
+    assert np.all(np.abs(y) <= np.minimum(np.abs(u), np.inf if limit is None else limit))
 
 
 @given(pieces, windows, st.integers(0, 10**6))
@@ -144,17 +139,6 @@ def test_a_tone_in_overload_is_scaled_not_clipped(frequency: float, over: float)
     assert limiter.gain == pytest.approx(math.sqrt(0.98 / over), rel=0.01)
 
 
-@pytest.mark.parametrize("frequency", [57.0, 143.0])
-def test_a_tone_that_does_not_fill_the_window_keeps_its_shape_too(frequency: float) -> None:
-    """Its power over a window swings by up to 1 / (pi 0.1 s f), 5.6 % at 57 Hz, and only the peak may reach 0.98.
-
-    Measured: 0.957 and -65 dB at 57 Hz, better above.
-    """
-    y = OutputLimiter(1.0, fs=FS).process(tone(frequency, 3.0, fs=FS, amplitude=math.sqrt(8.0)))
-    assert power_after(y, 1.0) > 0.95
-    assert distortion_db(y[16000:], frequency) < -55
-
-
 @pytest.mark.parametrize("over", [2.0, 10.0])
 def test_noise_in_overload_is_scaled_not_clipped(over: float) -> None:
     """Measured: 0.17 % clipped, 0.886 of the rated power, and an error 0.02 (2 x) and 0.03 (10 x) of the input's power
@@ -168,32 +152,6 @@ def test_noise_in_overload_is_scaled_not_clipped(over: float) -> None:
     assert np.mean((u - y) ** 2) / over < {2.0: 0.093, 10.0: 0.473}[over] + 0.04
 
 
-def test_bursts_that_come_again_are_foreseen() -> None:
-    """Ten decaying bursts a second, 1.5 times the rated power: scaled alike at their beginning and end.
-
-    A gain planned for the present loudness to last, not for the worst of late, loses a third of the power.
-    """
-    t = np.arange(32000) / FS
-    u = np.sin(2 * np.pi * 430 * t) * np.exp(-(t % 0.1) / 0.012)
-    u *= math.sqrt(1.5 / np.mean(u**2))
-    limiter = OutputLimiter(1.0, fs=FS)
-    y = limiter.process(u)
-    assert limiter.clipped < 0.001 * u.size
-    assert power_after(y, 1.0) > 0.9
-    assert np.mean((u - y) ** 2) / 1.5 < 0.06  # 0.034 with the future known
-
-
-def test_the_level_jumps_by_20_db() -> None:
-    """Up: the gain is there within two windows. Down: what then fits passes unchanged again after five."""
-    u = tone(230.0, 2.0, fs=FS, amplitude=math.sqrt(20.0))
-    u[:8000] *= 0.1
-    u[20000:] *= 0.1
-    y = OutputLimiter(1.0, fs=FS).process(u)
-    assert y[:8000].tobytes() == u[:8000].tobytes()
-    assert np.mean(y[11200:20000] ** 2) > 0.9
-    assert y[28000:].tobytes() == u[28000:].tobytes()
-
-
 def test_a_tone_over_the_amplitude_limit_is_scaled_to_it() -> None:
     """Not clipped to it, but in the first windows: -60 dB as above, where a clipped tone has -11 dB."""
     limiter = OutputLimiter(100.0, fs=FS, amplitude_limit=1.0)
@@ -202,15 +160,6 @@ def test_a_tone_over_the_amplitude_limit_is_scaled_to_it() -> None:
     assert power_after(y, 1.0) == pytest.approx(0.5, rel=0.01)
     assert distortion_db(y[16000:], 300.0) < -60
     assert limiter.clipped < 0.02 * y.size
-
-
-def test_rare_peaks_over_the_amplitude_limit_are_clipped_alone() -> None:
-    """Noise of power 0.3 with a limit at three times its rms: the rest of it stays as it is, bit for bit."""
-    u = band_limited_noise((200.0, 2000.0), 2.0, fs=FS, power=0.3, rng=2)
-    limiter = OutputLimiter(1.0, fs=FS, amplitude_limit=3 * math.sqrt(0.3))
-    y = limiter.process(u)
-    assert y.tobytes() == np.clip(u, -limiter.amplitude_limit, limiter.amplitude_limit).tobytes()
-    assert limiter.clipped == np.sum(y != u) > 0
 
 
 @pytest.mark.parametrize("rated_power", [1.0, 4.0])
@@ -222,13 +171,6 @@ def test_a_quiet_past_of_another_limiter_takes_no_more_than_its_power(rated_powe
     out = after.process(quiet)
     np.testing.assert_array_equal(out, quiet)  # a quarter of the rated power at most, so it passes bit for bit
     assert first_window_over(np.concatenate([played, out]), 64, rated_power) is None
-
-
-def test_a_window_of_one_sample_is_a_clip() -> None:
-    """At sqrt(rho_o), less the margin for rounding, some 1e-15; the gain that goes with it is 0.99 or less."""
-    y = limiter(1, 4.0).process([0.5, -1.3, -1000.0, 1e300])
-    assert y[:2].tolist() == [0.5, -1.3]
-    np.testing.assert_allclose(y[2:], [-2.0, 2.0], rtol=0.011)
 
 
 @given(pieces, windows, st.integers(0, 10**6), st.lists(st.integers(0, 200), max_size=4))
@@ -256,48 +198,6 @@ def test_nothing_accumulates_in_a_long_run() -> None:
     assert y[-1600:].tobytes() == u[-1600:].tobytes()
     for laps in ours.state.laps:
         assert np.all(np.isfinite(laps))
-
-
-@pytest.mark.parametrize("huge", [1e3, 1e150, 1.7e308])
-def test_a_huge_sample_is_forgotten_in_five_windows(huge: float) -> None:
-    u = np.random.default_rng(1).normal(scale=0.4, size=4000)
-    u[1000] = huge
-    y = limiter(200).process(u)
-    assert y[:1000].tobytes() == u[:1000].tobytes()
-    assert y[2000:].tobytes() == u[2000:].tobytes()
-
-
-@pytest.mark.parametrize("samples", [400, 1600])
-def test_the_gain_rises_with_a_time_constant_of_an_eighth_of_a_window(samples: int) -> None:
-    """After a huge sample. Towards 1.1, never faster; at that rate once the past leaves room for all of the input.
-
-    1e-12: the gains are near 1, their differences of 1e-3 a sample are rounded to some 1e-16.
-    """
-    u = np.full(4 * samples, 1e-3)
-    u[samples // 10] = 1e3
-    limited = limiter(samples)
-    gains = np.array([(limited(v), limited.gain)[1] for v in u])
-    risen = int(np.flatnonzero(gains < 1.0)[-1])
-    assert gains[samples // 5] < 0.05
-    assert samples < risen < 3 * samples
-    to_go = 1.1 - gains[samples // 5 : risen + 1]
-    rates = to_go[1:] / to_go[:-1]
-    expected = math.exp(-8.0 / samples)
-    assert rates.min() >= expected - 1e-12
-    np.testing.assert_allclose(rates[-samples // 20 :], expected, rtol=1e-12)
-
-
-def test_an_overload_is_forgotten() -> None:
-    """Bursts that fit, after half a second 20 times as loud: as if that had not been, to the bit.
-
-    MEMORY is 2 s here, in which the loud part's energy, 400 times as large, falls to the bursts' own in six times 2 s.
-    """
-    t = np.arange(240_000) / FS
-    u = np.sin(2 * np.pi * 430 * t) * np.exp(-(t % 0.1) / 0.012)
-    u *= math.sqrt(0.9 / np.mean(u**2))
-    expected = OutputLimiter(1.0, fs=FS).process(u)
-    u[:8000] *= 20.0
-    assert OutputLimiter(1.0, fs=FS).process(u)[-16000:].tobytes() == expected[-16000:].tobytes()
 
 
 def test_the_rating_scales_everything() -> None:
