@@ -57,6 +57,7 @@ def identify(options: argparse.Namespace) -> int:
     """Fit an impulse response, write it and print what it leaves unexplained."""
     from ..paths import estimate_path
     from ..paths.file_checks import require_different
+    from ..paths.timing import plays_once
 
     _require_output(options.output)
     files = Files(options)
@@ -70,6 +71,12 @@ def identify(options: argparse.Namespace) -> int:
         )
     found = estimate_path(sent[:shortest], heard[:shortest], options.taps, files.fs)
     _judge_residual(options, found.residual_db, files.fs, sent[:shortest], heard[:shortest])
+    if plays_once(sent):
+        warn(
+            options,
+            f"{options.excitation} plays each frequency once, so clocks that differ and lost samples would not show: unless "
+            "one interface plays and records, play noise, or the sweep twice",
+        )
     _write_path(options.output, found.taps, files.fs)
     facts = {"n_taps": options.taps, "fs": files.fs, "residual_db": float(found.residual_db), "output": options.output}
     text = f"{options.output}: {options.taps} taps, which leave {found.residual_db:.1f} dB of the response unexplained"

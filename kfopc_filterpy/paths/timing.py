@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 _SEGMENT_S, _LEAST_SEGMENTS, _MOST_SEGMENTS = 1.0, 8, 64
-_LEAST_DELAY = 0.5  # samples by which the delay must change over a record
+_LEAST_DELAY, _LEAST_JUMP = 0.5, 8  # samples by which the delay must change over a record, or at once
+_LARGEST_DRIFT = 1e-3  # of clocks; quartzes differ by less, so more is a jump between the halves
 _LEAST_GAIN = 0.8  # of the power left unexplained, once the delay is put right: what does less is not the cause
 _LEAST_LEAD = 0.5  # of a response's energy that comes before time 0: the files are swapped
 _SPECTRUM = 4096  # samples of a spectrum's segments at most
 _FLOOR = 1e-3  # of the mean power, added to a spectrum that is divided by
+_FRAMES, _NEAR, _ONCE = 64, 2, 0.8  # of a record; beside the loudest, and of their power: a frequency is played once
+_LOST = "a block was lost, so record both again in one stream, or cut both there."
 
 
 def timing_fault(sent: np.ndarray, heard: np.ndarray, fs: float, names: tuple[str, str]) -> str | None:
@@ -17,19 +20,36 @@ def timing_fault(sent: np.ndarray, heard: np.ndarray, fs: float, names: tuple[st
 
     The response from one to the other is estimated in segments of about a second. Its delay rises evenly if the clocks
     differ, and jumps where samples are missing. A cause is named only if putting it right leaves clearly less unexplained.
-    The halves of the record are compared, too: of sweeps, each second has another band. A single sweep shows no drift.
+    The halves of the record are compared, too: of sweeps, each second has another band. See `plays_once` for one sweep.
     """
     from scipy.ndimage import map_coordinates
 
     n = min(sent.size, heard.size)
     sent, heard = sent[:n] - np.mean(sent), heard[:n] - np.mean(heard)
     left = _unexplained(sent, heard)
-    for count in (int(np.clip(n / (_SEGMENT_S * fs), _LEAST_SEGMENTS, _MOST_SEGMENTS)), 2):
+    for count in (
+        int(np.clip(n / (_SEGMENT_S * fs), _LEAST_SEGMENTS, _MOST_SEGMENTS)),
+        *([] if plays_once(sent) else [2]),
+    ):
         cause, places = _cause(sent, heard, count, fs, names[1])
         if cause and _unexplained(sent, map_coordinates(heard, [places], order=3)) < _LEAST_GAIN * left:
             return cause
     lead = _lead(sent, heard) if left < _LEAST_LEAD else 0
-    return f"{names[1]} comes {1e3 * lead / fs:.3g} ms before {names[0]}: are the files swapped?" if lead else None
+    early = f"{names[1]} comes {1e3 * lead / fs:.3g} ms before {names[0]}"
+    return f"{early}: are the files swapped, or was a block lost?" if lead else None
+
+
+def plays_once(sent: np.ndarray) -> bool:
+    """Return whether each frequency is played at one time, and not all at the same, as by a single sweep.
+
+    Then clocks that differ and lost samples cannot be told from a path that delays some frequencies more than others.
+    """
+    frames = sent[: sent.size // _FRAMES * _FRAMES].reshape(_FRAMES, -1)
+    power = np.abs(np.fft.rfft(np.hamming(frames.shape[1]) * frames)) ** 2
+    loudest = np.argmax(power, axis=0)
+    near = np.abs(np.arange(_FRAMES)[:, np.newaxis] - loudest) <= _NEAR
+    spread = np.sqrt(np.cov(loudest, aweights=np.sum(power, axis=0)))
+    return bool(np.sum(power[near]) > _ONCE * np.sum(power) and spread > 2 * _NEAR)
 
 
 def _cause(sent: np.ndarray, heard: np.ndarray, count: int, fs: float, name: str) -> tuple[str, np.ndarray]:
@@ -42,10 +62,17 @@ def _cause(sent: np.ndarray, heard: np.ndarray, count: int, fs: float, name: str
     splits = [np.concatenate([part - part.mean() for part in np.split(delays, [at])]) for at in range(1, count)]
     at = 1 + int(np.argmin([np.sum(left**2) for left in splits]))
     jump = round(float(np.median(delays[at:]) - np.median(delays[:at])))
-    if count > 2 and jump and np.sum(splits[at - 1] ** 2) < np.sum((delays - start - slope * times) ** 2):
+    if count == 2 and abs(slope) > _LARGEST_DRIFT:
+        cause = f"in its second half, {name} is {abs(jump)} samples {'later' if jump > 0 else 'earlier'} than in its first: "
+        return cause + _LOST, every + np.where(every < every.size // 2, 0, jump)
+    if (
+        count > 2
+        and abs(jump) >= _LEAST_JUMP
+        and np.sum(splits[at - 1] ** 2) < np.sum((delays - start - slope * times) ** 2)
+    ):
         cause = (
             f"from about {at * size / fs:.2g} s on, {name} is {abs(jump)} samples {'later' if jump > 0 else 'earlier'} than "
-            "before: a block was lost, so record both again in one stream, or cut both there."
+            "before: " + _LOST
         )
         return cause, every + np.where(every < at * size, 0, jump)
     if abs(slope) * every.size >= _LEAST_DELAY:

@@ -9,7 +9,7 @@ import pytest
 
 from kfopc_filterpy import Plant
 from kfopc_filterpy.commands import main
-from kfopc_filterpy.paths.timing import timing_fault
+from kfopc_filterpy.paths.timing import plays_once, timing_fault
 from kfopc_filterpy.power import AmplifierRating
 from kfopc_filterpy.signals import write_wav
 from kfopc_filterpy.verdict import assess
@@ -56,16 +56,51 @@ def test_a_lost_block_is_told_with_its_samples_and_its_place(sent, lost, said):
     assert float(re.match(r"from about (\S+) s on, d is", fault)[1]) == pytest.approx(3, abs=1)
 
 
+def sweep(times, seconds):
+    """Return sweeps of some seconds from 200 to 3000 Hz, one after the other."""
+    within = np.mod(times, seconds)
+    return np.sin(2 * np.pi * (200 * within + 1400 / seconds * within**2))
+
+
 def test_clocks_that_differ_show_in_a_sweep_that_is_played_twice():
     times = np.arange(N) / FS
-    sweep = np.sin(2 * np.pi * (200 * np.mod(times, 4) + 350 * np.mod(times, 4) ** 2))  # 200 to 3000 Hz in 4 s
-    drifting = np.mod(times * (1 - 50e-6) - DELAY / FS, 4)
-    heard = 0.5 * np.sin(2 * np.pi * (200 * drifting + 350 * drifting**2))
-    assert re.search(r"the clocks differ by \+(4\d|5\d)\.\d ppm", timing_fault(sweep, heard, FS, ("x", "d")))
+    heard = 0.5 * sweep(times * (1 - 50e-6) - DELAY / FS, 4)
+    assert re.search(r"the clocks differ by \+(4\d|5\d)\.\d ppm", timing_fault(sweep(times, 4), heard, FS, ("x", "d")))
+
+
+def test_a_lost_block_shows_in_sweeps():
+    """Between sweeps that are played twice, with its samples; in a single sweep, it may have other causes."""
+    times = np.arange(N) / FS
+    for seconds, lost, told in (
+        (4, 4.0, "in its second half, d is 256 samples earlier than in its first: a block was lost"),
+        (8, 4.0, "d comes 29.5 ms before x: are the files swapped, or was a block lost?"),
+    ):
+        heard = sweep(times - DELAY / FS + np.where(times < lost, 0, 256 / FS), seconds)
+        assert timing_fault(sweep(times, seconds), heard, FS, ("x", "d")).startswith(told)
+
+
+def test_only_a_single_sweep_plays_each_frequency_once(sent):
+    times = np.arange(N) / FS
+    assert plays_once(np.pad(sweep(times, 8), FS))
+    for one in (sent, sweep(times, 4), np.eye(N, 1)[:, 0], sent * (times < 0.2)):
+        assert not plays_once(one)
+
+
+def test_identify_says_what_a_single_sweep_does_not_show(tmp_path, capsys):
+    """With clocks 50 ppm apart, it explains all but -40 dB: a path that delays high frequencies more looks the same."""
+    times = np.arange(N) / FS
+    for name, signal in (("x", sweep(times, 8)), ("d", sweep(times * (1 - 50e-6) - DELAY / FS, 8))):
+        write_wav(tmp_path / f"{name}.wav", signal, FS)
+    names = [str(tmp_path / f"{name}.wav") for name in ("x", "d", "S")]
+    assert main(["paths", "identify", *names[:2], "--taps", "64", "-o", names[2]]) == 0
+    assert "x.wav plays each frequency once, so clocks that differ and lost samples" in capsys.readouterr().err
 
 
 def test_swapped_files_are_told(sent):
-    assert timing_fault(with_clock(0), sent, FS, ("x", "d")) == "d comes 2.5 ms before x: are the files swapped?"
+    assert (
+        timing_fault(with_clock(0), sent, FS, ("x", "d"))
+        == "d comes 2.5 ms before x: are the files swapped, or was a block lost?"
+    )
 
 
 @pytest.mark.parametrize("noise_gain", [0, 0.5, 3])
