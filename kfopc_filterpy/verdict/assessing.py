@@ -50,15 +50,7 @@ from .._types import ProgressBar
 from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on, nominal_hz
 from .candidates import CANDIDATES, CHOSEN, DIRECT, ONE_CHANNEL, Settings
 from .fixed_filters import FixedFilters, longest_filter
-from .limits import (
-    ChannelLimits,
-    Limits,
-    Ratings,
-    limits_of,
-    ratings_of_each,
-    scale_of,
-    watt_per_power,
-)
+from .limits import Limits, Ratings, limits_of, ratings_of_each, scale_of, watt_per_power
 from .runs import NSE_WINDOW_S, Plan, announce, one_blas_thread
 
 ALL = "all"
@@ -591,9 +583,8 @@ def _a_weighted_db(signals: np.ndarray, fs: float) -> float:
 
 def _figures(run: SimulationResult, limits: Limits, fs: float, settings: Settings) -> dict[str, Any]:
     """Return the figures of merit of a run and its settings; with several channels also of each microphone."""
-    several = isinstance(limits, ChannelLimits)  # also if only the references are several
     signals = (run.control_signal, run.error, run.disturbance)
-    y, e, d = (np.atleast_2d(signal) if several else signal for signal in signals)
+    y, e, d = (np.atleast_2d(signal) if limits.several else signal for signal in signals)
     power = output_power(y)
     figures = {
         "noise_reduction_db": noise_reduction_db(e, d),
@@ -606,7 +597,7 @@ def _figures(run: SimulationResult, limits: Limits, fs: float, settings: Setting
         "diverged_at_s": run.diverged_at_s,
         "settings": {key: float(settings[key]) for key in settings if key in CHOSEN},
     }
-    if not several:
+    if not limits.several:
         return figures
     return figures | {
         "noise_reduction_by_microphone_db": [noise_reduction_db(*pair) for pair in zip(e, d, strict=True)]

@@ -130,9 +130,8 @@ class Assessment:
         Further remarks on the data.
     algorithm : str
         The controller that the verdict is on.
-    limits : OutputLimits or ChannelLimits
-        What the rating allows the control signal; with several channels a tuple `each` of them, one for each
-        loudspeaker.
+    limits : Limits
+        What the rating allows the control signal; `each` has the limits of each loudspeaker.
     ceilings : Ceilings
         Noise reductions that nothing can surpass, one after the other.
     bound_db : float

@@ -15,7 +15,7 @@ from scipy.signal import fftconvolve
 from kfopc_filterpy import OutputPowerConstraint
 from kfopc_filterpy.bounds import SuggestedSettings
 
-from .limits import ChannelLimits, Limits, each_of
+from .limits import Limits
 
 # Step sizes over the taps and the power of the filtered reference. From twice the largest on, gradient descent diverges
 # on any noise; with the smallest it learns for some 10^4 samples per tap.
@@ -70,14 +70,14 @@ class Known:
     @property
     def constraint(self) -> Settings:
         """Output power constraint, or one for each loudspeaker."""
-        each = [OutputPowerConstraint(one.rated_power, fs=self.fs) for one in each_of(self.limits)]
-        return {"constraint": each if isinstance(self.limits, ChannelLimits) else each[0]}
+        each = (OutputPowerConstraint(one.rated_power, fs=self.fs) for one in self.limits.each)
+        return {"constraint": self.limits.own(each)}
 
     @property
     def peak(self) -> Settings:
         """Amplitude at which the amplifier clips, by default the peak of a sine at rated power."""
-        each = [one.amplitude_limit or np.sqrt(2.0 * one.rated_power) for one in each_of(self.limits)]
-        return {"amplitude_limit": np.array(each) if isinstance(self.limits, ChannelLimits) else each[0]}
+        each = (one.amplitude_limit or np.sqrt(2.0 * one.rated_power) for one in self.limits.each)
+        return {"amplitude_limit": self.limits.own(each)}
 
     def steps(self, **further: Any) -> list[Settings]:
         """Return all step sizes, with further settings."""

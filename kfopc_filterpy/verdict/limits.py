@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, TypeGuard, cast
 
@@ -12,33 +12,39 @@ from kfopc_filterpy import HardClipAmplifier, LinearAmplifier
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating, OutputLimits, output_limits
 
 from .._types import NumberOrArray
-from ..power.amplifiers import Amplifier
 from ..power.ratings import Rating
 
 Ratings: TypeAlias = Rating | Sequence[Rating | Sequence[Rating]]  # of one loudspeaker, or of each
 
 
 @dataclass(frozen=True)
-class ChannelLimits:
-    """What ratings allow the control signals of several loudspeakers; the shortest window counts for all.
+class Limits:
+    """What ratings allow the control signals; with one channel its attributes are numbers, else one for each loudspeaker.
 
     Attributes
     ----------
     each : tuple of OutputLimits
         Limits of each loudspeaker.
+    several : bool
+        Whether there are several channels, be it only of references or of microphones.
     """
 
     each: tuple[OutputLimits, ...]
+    several: bool
+
+    def own(self, values: Iterable[Any]) -> Any:
+        """Return the only value, or with several channels a tuple of those of each loudspeaker."""
+        return tuple(values) if self.several else next(iter(values))
 
     @property
-    def rated_power(self) -> np.ndarray:
-        """Rated power of each loudspeaker, (J,)."""
-        return np.array([one.rated_power for one in self.each])
+    def rated_power(self) -> NumberOrArray:
+        """Rated power, or that of each loudspeaker, (J,)."""
+        return np.array(self.own(one.rated_power for one in self.each))[()]
 
     @property
-    def amplitude_limit(self) -> tuple[float | None, ...]:
-        """Largest magnitude of each control signal; None if there is no limit."""
-        return tuple(one.amplitude_limit for one in self.each)
+    def amplitude_limit(self) -> Any:
+        """Largest magnitude of the control signal; None if there is no limit."""
+        return self.own(one.amplitude_limit for one in self.each)
 
     @property
     def window_s(self) -> float:
@@ -46,16 +52,28 @@ class ChannelLimits:
         return min(one.window_s for one in self.each)
 
     @property
-    def decided_by(self) -> tuple[str, ...]:
-        """Which rating each rated power comes from."""
-        return tuple(one.decided_by for one in self.each)
+    def decided_by(self) -> Any:
+        """Which rating the rated power comes from."""
+        return self.own(one.decided_by for one in self.each)
 
-    def limiter(self, fs: float) -> tuple[Any, ...]:
-        """Return a limiter for each loudspeaker at a sample rate `fs` in Hz."""
-        return tuple(one.limiter(fs) for one in self.each)
+    def limiter(self, fs: float) -> Any:
+        """Return a limiter at a sample rate `fs` in Hz."""
+        return self.own(one.limiter(fs) for one in self.each)
 
+    def amplifier(self) -> Any:
+        """Return an amplifier that clips at the limit."""
+        peaks = (one.amplitude_limit for one in self.each)
+        return self.own(LinearAmplifier() if peak is None else HardClipAmplifier(peak) for peak in peaks)
 
-Limits = OutputLimits | ChannelLimits
+    def scaled(self, share: float) -> Limits:
+        """Return limits with `share` times the rated powers, and peaks in proportion."""
+        root = float(np.sqrt(share))
+        peaks = [one.amplitude_limit and root * one.amplitude_limit for one in self.each]
+        powers = [share * one.rated_power for one in self.each]
+        each = zip(self.each, powers, peaks, strict=True)
+        return replace(
+            self, each=tuple(replace(one, rated_power=power, amplitude_limit=peak) for one, power, peak in each)
+        )
 
 
 def ratings_of_each(rating: Ratings, n_loudspeakers: int) -> list[list[Rating]]:
@@ -90,37 +108,10 @@ def _is_sequence(value: object) -> TypeGuard[Sequence[Any]]:
 
 
 def limits_of(ratings: Sequence[Sequence[Rating]], several: bool) -> Limits:
-    """Return what ratings allow: `OutputLimits` with one channel, `ChannelLimits` with several."""
-    each = tuple(output_limits(list(one)) for one in ratings)
-    if not several:
-        return each[0]
+    """Return what ratings allow; the shortest window counts for all loudspeakers."""
+    each = [output_limits(list(one)) for one in ratings]
     window = min(one.window_s for one in each)
-    return ChannelLimits(tuple(replace(one, window_s=window) for one in each))
-
-
-def each_of(limits: Limits) -> tuple[OutputLimits, ...]:
-    """Return the limits of each loudspeaker."""
-    return limits.each if isinstance(limits, ChannelLimits) else (limits,)
-
-
-def _like(limits: Limits, each: Sequence[OutputLimits]) -> Limits:
-    return ChannelLimits(tuple(each)) if isinstance(limits, ChannelLimits) else each[0]
-
-
-def scaled(limits: Limits, share: float) -> Limits:
-    """Return limits with `share` times the rated powers, and peaks in proportion."""
-    root, each = float(np.sqrt(share)), each_of(limits)
-    peaks = [one.amplitude_limit and root * one.amplitude_limit for one in each]
-    powers = [share * one.rated_power for one in each]
-    pairs = zip(each, powers, peaks, strict=True)
-    return _like(limits, [replace(one, rated_power=power, amplitude_limit=peak) for one, power, peak in pairs])
-
-
-def amplifiers(limits: Limits) -> Amplifier | Sequence[Amplifier]:
-    """Return the amplifier that clips at the limit, or a list with one for each loudspeaker."""
-    peaks = (one.amplitude_limit for one in each_of(limits))
-    each = [LinearAmplifier() if peak is None else HardClipAmplifier(peak) for peak in peaks]
-    return each if isinstance(limits, ChannelLimits) else each[0]
+    return Limits(tuple(replace(one, window_s=window) for one in each), several)
 
 
 def watt_per_power(volts_per_unit: NumberOrArray | None, ohm: NumberOrArray | None) -> NumberOrArray | None:

@@ -22,7 +22,7 @@ from kfopc_filterpy.metrics import nse_db
 
 from .._types import ProgressBar
 from .candidates import CANDIDATES, Known, Settings, filtered_power
-from .limits import ChannelLimits, Limits, amplifiers, scaled
+from .limits import Limits
 
 NSE_WINDOW_S = 0.1  # of the figures that are drawn beside the time of convergence
 TUNED_ON_S = 5.0  # of the record, if there are several settings to try
@@ -90,7 +90,7 @@ class Plan:
 
     def run(self, name: str, *, limited: bool, share: float = 1.0) -> SimulationResult:
         """Run an algorithm with its best setting, behind a limiter or not, with a share of the rating's power."""
-        limits = scaled(self.limits, share)
+        limits = self.limits.scaled(share)
         limiter, best = limits.limiter(self.fs) if limited else None, self.best(name, limits)
         if share == 1.0:
             self.chosen[name] = best
@@ -114,7 +114,7 @@ class Plan:
         return simulate(
             controller,
             x,
-            Plant(self.s, amplifier=amplifiers(limits), fs=self.fs),
+            Plant(self.s, amplifier=limits.amplifier(), fs=self.fs),
             disturbance=d,
             switch_on_s=self.start / self.fs,
             **options,
@@ -122,7 +122,7 @@ class Plan:
 
     def controller(self, name: str, settings: Settings, **options: Any) -> Any:
         """Return a fresh controller."""
-        if isinstance(self.limits, ChannelLimits):
+        if self.limits.several:
             options["n_references"] = len(self.x)
         return CORE[name](self.settings.n_taps, self.s, **settings, **options)
 
