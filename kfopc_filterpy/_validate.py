@@ -196,14 +196,14 @@ def as_choice(value: Any, name: str, choices: Iterable[Choice]) -> Choice:
     return value
 
 
-def as_band(band: Any, fs: float, name: str = "band") -> tuple[float, float]:
+def as_band(band: Any, fs: float) -> tuple[float, float]:
     """Return `band` as (low, high) in Hz with 0 <= low < high <= fs/2."""
     try:
-        low, high = (as_number(edge, name, unit="Hz") for edge in band)
+        low, high = (as_number(edge, "band", unit="Hz") for edge in band)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a pair (low, high) in Hz, got {band!r}") from error
+        raise ValueError(f"band must be a pair (low, high) in Hz, got {band!r}") from error
     if not 0 <= low < high <= fs / 2:
-        raise ValueError(f"{name} must satisfy 0 <= low < high <= fs/2 = {fs / 2:g} Hz, got ({low:g}, {high:g}) Hz")
+        raise ValueError(f"band must satisfy 0 <= low < high <= fs/2 = {fs / 2:g} Hz, got ({low:g}, {high:g}) Hz")
     return low, high
 
 

@@ -28,7 +28,6 @@ from numpy.typing import ArrayLike
 from ._types import NumberOrArray, PerLoudspeaker
 from ._validate import (
     as_band,
-    as_choice,
     as_number,
     as_positive,
     as_real_array,
@@ -533,10 +532,9 @@ def power_spectrum_db(
     *,
     steady: float = 0.5,
     segment_s: float = 0.128,
-    scaling: str = "density",
     runs: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the power spectrum by Welch's method, with a Hann window and half overlap.
+    """Return the power spectral density by Welch's method, with a Hann window and half overlap.
 
     Parameters
     ----------
@@ -548,9 +546,6 @@ def power_spectrum_db(
         Portion of the run, from its end.
     segment_s : float, default 0.128
         Length of a segment in seconds, cut to the portion if that is shorter; its inverse is the resolution in Hz.
-    scaling : {"density", "spectrum"}, default "density"
-        "density": dB of power per Hz, for noise. "spectrum": dB of power, in which a tone that lies on a bin
-        reads its own power.
     runs : bool, default False
         The leading axis counts runs; powers are averaged over them.
 
@@ -559,27 +554,21 @@ def power_spectrum_db(
     frequencies : ndarray, shape (n_bins,)
         Frequencies in Hz, from 0 to fs/2.
     level : ndarray, shape (n_bins,) or (n_channels, n_bins)
-        Level in dB.
-
-    Raises
-    ------
-    ValueError
-        If `scaling` is unknown.
+        Power per Hz in dB.
 
     Examples
     --------
     >>> import numpy as np
-    >>> x = np.sqrt(2) * np.sin(2 * np.pi * 1000 / 16000 * np.arange(16000))
-    >>> f, level = power_spectrum_db(x, 16000, segment_s=0.1, scaling="spectrum")
-    >>> float(f[np.argmax(level)]), abs(round(float(np.max(level)), 6))
-    (1000.0, 0.0)
+    >>> x = np.random.default_rng(1).standard_normal(160000)  # of power 1 over 8000 Hz: -39.0 dB
+    >>> f, level = power_spectrum_db(x, 16000)
+    >>> round(float(10 * np.log10(np.mean(10 ** (level / 10)))), 1)
+    -39.0
     """
     from scipy.signal import welch
 
     part = _steady_part(_as_runs(signal, "signal", runs), steady)
     segment = min(as_sample_count(segment_s, fs, "segment_s"), part.shape[-1])
-    kind = as_choice(scaling, "scaling", ("density", "spectrum"))
-    frequencies, power = welch(part, fs, nperseg=segment, detrend=False, scaling=kind)
+    frequencies, power = welch(part, fs, nperseg=segment, detrend=False)
     return frequencies, _ratio_db(power.mean(axis=0), 1.0)
 
 

@@ -147,7 +147,7 @@ def test_a_plant_and_its_changes_are_refused_or_have_finite_paths_and_a_finite_d
 
 
 WORDS = [
-    *("verdict", "paths", "identify", "inspect", "convert", "run"),
+    *("verdict", "paths", "identify", "inspect", "run"),
     *("noise.wav", "P.wav", "S.wav", "d.wav", "empty.wav", "text.wav", "zeros.wav"),
     *("nan.npy", "stereo.wav", "tiny.csv"),
     *("missing.wav", ".", "/dev/null", "", "é\u0000"[:1], "out.wav", "no/folder/out.wav", "out.xyz", "--", "-o"),
@@ -160,8 +160,7 @@ WORDS = [
 SCENE = ["noise.wav", "--primary", "P.wav", "--secondary", "S.wav", "--rated-power", "0.1"]
 COMMANDS = [
     ["paths", "inspect", "S.wav", "--primary", "P.wav", "--fs", "8000"],
-    ["paths", "convert", "S.wav:0", "-o", "S2.csv"],
-    ["paths", "convert", "S.wav", "-o", "S3.wav", "--fs", "4000"],
+    ["paths", "inspect", "S.wav:0", "--fs", "4000"],
     ["paths", "identify", "noise.wav", "d.wav", "--taps", "16", "-o", "S4.wav"],
     ["verdict", *SCENE, "--ohm", "8", "--want-db", "nan"],
     ["run", *SCENE, "--seconds", "nan"],

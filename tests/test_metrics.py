@@ -362,7 +362,6 @@ def test_silent_disturbance_gives_nan_without_a_warning():
         (lambda: harmonics_db(np.ones(999), np.ones(999), 5e3, FS), ValueError, "second harmonic below fs/2"),
         (lambda: coherence_of(np.ones(999), np.ones(999)), ValueError, "at least 8 segments"),
         (lambda: coherence_of(np.ones(FS), np.ones(FS), (201, 202)), ValueError, "holds no frequency bin"),
-        (lambda: power_spectrum_db([1.0], FS, scaling="power"), ValueError, "scaling must be one of"),
         (lambda: metrics.a_weighting_db([-1.0]), ValueError, "frequencies_hz must not be negative"),
         (lambda: metrics.third_octave_levels_db(np.ones(4), FS), ValueError, "must be longer for a third-octave band"),
     ],

@@ -1,4 +1,4 @@
-"""`kfopc paths`: identify, inspect and convert impulse responses."""
+"""`kfopc paths`: identify and inspect impulse responses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ POOR_DB = -20.0  # a warning is printed if more of the response is left unexplai
 
 def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     """Add the subcommand, which has actions of its own."""
-    about = "identify, inspect and convert impulse responses"
+    about = "identify and inspect impulse responses"
     parser = commands.add_parser("paths", help=about, description=sentence(about))
     actions = parser.add_subparsers(required=True, metavar="ACTION")
 
@@ -45,11 +45,6 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     about = "impulse response of the primary path, for the causality margin"
     own.add_argument("--primary", metavar="FILE", help=about)
     own.add_argument("--json", action="store_true", help="print JSON")
-    add_reading(own)
-    about = "write an impulse response in another format, or at another sample rate"
-    own = add("convert", convert, about, "S.wav -o S16.csv --fs 16000")
-    own.add_argument("path", help="the impulse response")
-    own.add_argument("-o", "--output", metavar="FILE", required=True, help=f"file to write: {', '.join(WRITTEN)}")
     add_reading(own)
 
 
@@ -187,16 +182,6 @@ def _described(facts: dict[str, Any]) -> str:
         f"power gain {facts['power_gain_db']:.1f} dB; within 3 dB of its peak from {facts['low_hz']:.0f} to "
         f"{facts['high_hz']:.0f} Hz"
     )
-
-
-def convert(options: argparse.Namespace) -> int:
-    """Write an impulse response in another format or at another rate."""
-    _require_output(options.output)
-    files = Files(options)
-    taps = files.path(options.path)
-    _write_path(options.output, taps, files.fs)
-    print(f"{options.output}: {taps.size} taps at {files.fs:g} Hz")
-    return DONE
 
 
 def _require_output(output: str) -> None:

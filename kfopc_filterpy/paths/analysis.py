@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike
 
 from .._taps import finite_taps, path_taps, sampling_rate
 from .._types import PathModel
-from .._validate import as_band, as_number, as_positive, as_signal
+from .._validate import as_band, as_signal
 from ..plant import Plant, as_constant_plant, has_one_channel
 from .file_checks import require_sound
+
+_EDGE_DB = -3.0  # of a band, relative to the peak of the response
 
 
 def frequency_response(path: PathModel, frequencies_hz: ArrayLike, *, fs: float | None = None) -> np.ndarray:
@@ -141,69 +143,51 @@ class AchievedBand:
     Attributes
     ----------
     low_hz, high_hz : float
-        Outermost frequencies at which the response is at `level_db` relative to its peak; 0 or fs/2 if it does not fall
-        that low.
-    peak_hz : float
-        Frequency of the peak.
-    peak_db : float
-        Response at the peak in dB.
-    level_db : float
-        Level, relative to the peak, that marks the band.
+        Outermost frequencies at which the response is 3 dB below its peak; 0 or fs/2 if it does not fall that low.
     """
 
     low_hz: float
     high_hz: float
-    peak_hz: float
-    peak_db: float
-    level_db: float
 
 
-def achieved_band(path: PathModel, level_db: float = -3.0, *, fs: float | None = None) -> AchievedBand:
-    """Return the band within which the response of a path stays above a level: what its taps really pass.
+def achieved_band(path: PathModel, *, fs: float | None = None) -> AchievedBand:
+    """Return the band at whose edges the response of a path is 3 dB below its peak: what its taps really pass.
 
     Parameters
     ----------
     path : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
         Discrete-time system or impulse response.
-    level_db : float, default -3.0
-        Level that marks the edges, in dB relative to the peak; negative.
     fs : float, optional
         Sampling rate in Hz, needed for a tap array.
 
     Returns
     -------
     AchievedBand
-        Edges (interpolated on a grid of fs/65536) and peak.
+        Edges, interpolated on a grid of fs/65536.
 
     Raises
     ------
     TypeError, ValueError
-        If `level_db` is not negative, or the path is silent.
+        If the path is silent, or has no sampling rate.
 
     Examples
     --------
     >>> from kfopc_filterpy import bandpass_path
-    >>> band = achieved_band(bandpass_path(32, fs=16000), level_db=-6.0)  # designed for 20 to 5000 Hz
+    >>> band = achieved_band(bandpass_path(32, fs=16000))  # designed for 20 to 5000 Hz
     >>> band.low_hz, round(band.high_hz)
-    (0.0, 4997)
+    (0.0, 4792)
     """
     fs = sampling_rate(path, fs)
-    level_db = as_number(level_db, "level_db", unit="dB")
-    if level_db >= 0:
-        raise ValueError(f"level_db must be negative (relative to the peak), got {level_db:g} dB")
     frequencies = np.linspace(0.0, fs / 2, 2**15 + 1)
     magnitude = np.abs(_response_on_grid(path, frequencies.size))
     peak = int(np.argmax(magnitude))
     if magnitude[peak] == 0:
         raise ValueError("path must not be all zeros: a silent path has no band")
-    level = magnitude[peak] * 10 ** (level_db / 20)
+    level = magnitude[peak] * 10 ** (_EDGE_DB / 20)
     above = np.flatnonzero(magnitude >= level)
     return AchievedBand(
         low_hz=_crossing(frequencies, magnitude, level, above[0], above[0] - 1),
         high_hz=_crossing(frequencies, magnitude, level, above[-1], above[-1] + 1),
-        peak_hz=float(frequencies[peak]),
-        peak_db=float(20 * np.log10(magnitude[peak])),
-        level_db=level_db,
     )
 
 
@@ -226,8 +210,8 @@ class CausalityMargin:
     Attributes
     ----------
     primary_onset_s : float or numpy.ndarray, shape (K,)
-        Energy onset of the primary path in s: the time by which its impulse response has delivered `onset_share` of its
-        energy. With several channels the earliest over the references, at each microphone.
+        Energy onset of the primary path in s: the time by which its impulse response has delivered 1 % of its energy,
+        which ignores the ringing before a band-limited arrival. With several channels the earliest over the references, at each microphone.
     secondary_onset_s : float or numpy.ndarray, shape (K, J)
         Energy onset of the secondary path, or of that from each loudspeaker to each microphone; inf for a silent one.
     fs : float
@@ -267,11 +251,7 @@ def energy_onset(taps: np.ndarray, share: float = 0.01) -> int:
     return int(np.searchsorted(energy, share * energy[-1]))
 
 
-def causality_margin(
-    plant: Plant,
-    *,
-    onset_share: float = 0.01,
-) -> CausalityMargin:
+def causality_margin(plant: Plant) -> CausalityMargin:
     """Return the causality margin, the delay of the primary path over that of the secondary path.
 
     The control filter has this much time to act. Without any it must predict the noise, which works for tones only.
@@ -280,9 +260,6 @@ def causality_margin(
     ----------
     plant : Plant
         Plant with a primary path.
-    onset_share : float, default 0.01
-        Share of the energy that marks the onset, above 0 and below 1. The default of 1 % ignores the ringing before a
-        band-limited arrival.
 
     Returns
     -------
@@ -312,9 +289,6 @@ def causality_margin(
     >>> margin
     <CausalityMargin of 2 microphone(s) and 2 loudspeaker(s): 0.625 ms, 5 samples>
     """
-    share = as_positive(onset_share, "onset_share")
-    if share >= 1:
-        raise ValueError(f"onset_share must be below 1, got {share:g}")
     as_constant_plant(plant, "causality_margin")
     if plant.primary is None:
         raise ValueError("plant must have a primary path: make it with Plant(secondary, primary)")
@@ -323,7 +297,7 @@ def causality_margin(
     require_sound("secondary", s)
 
     def onsets(paths: np.ndarray) -> np.ndarray:
-        return np.array([[energy_onset(h, share) / fs if np.any(h) else np.inf for h in row] for row in paths])
+        return np.array([[energy_onset(h) / fs if np.any(h) else np.inf for h in row] for row in paths])
 
     primary_onset, secondary_onset = onsets(p).min(axis=1), onsets(s)
     if has_one_channel(plant, p[0]):

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._validate import as_count, as_nonnegative, as_number, as_positive
+from .._validate import as_nonnegative, as_number, as_positive
 from ..plant import Plant
 
-# Share of a response's energy that may be cut off: -50 dB if the number of taps is chosen here, -40 dB if it is given.
-_CHOSEN_CUT, _ALLOWED_CUT = 1e-5, 1e-4
+_CUT = 1e-5  # share of a response's energy that may be cut off: -50 dB
 # Length of the synthesis. A response that has not decayed by half of it is refused, so it does not alias.
 _N_FFT = 2**16
 
@@ -56,8 +55,8 @@ class Duct:
 
     Examples
     --------
-    >>> Duct(length_m=2.6).resonances_hz(250.0).round(1)
-    array([ 33. ,  98.9, 164.9, 230.9])
+    >>> duct_plant(Duct(length_m=2.6), fs=8000)
+    <Plant at 8000 Hz: secondary path of 384 taps, primary path of 512 taps>
     """
 
     length_m: float = 2.2
@@ -83,28 +82,6 @@ class Duct:
         self._check_positions()
         self._check_reflection()
 
-    def resonances_hz(self, highest_hz: float) -> np.ndarray:
-        """Return the resonances of the lossless duct up to a frequency, in Hz.
-
-        They lie at ``n c / 2L`` if both ends reflect with the same sign, at ``(2n - 1) c / 4L`` if with opposite signs.
-
-        Parameters
-        ----------
-        highest_hz : float
-            Frequency up to which to list them, in Hz.
-
-        Returns
-        -------
-        numpy.ndarray, shape (n_resonances,)
-            Resonances in Hz; empty if an end does not reflect.
-        """
-        round_trip, spacing_hz = self.reflection[0] * self.reflection[1], self.speed_of_sound / self.length_m
-        if round_trip == 0:
-            return np.array([])
-        orders = np.arange(1, int(2 * highest_hz / spacing_hz) + 2)
-        resonances = orders * spacing_hz / 2 if round_trip > 0 else (2 * orders - 1) * spacing_hz / 4
-        return resonances[resonances <= highest_hz]
-
     def _check_positions(self) -> None:
         positions = {name: getattr(self, name) for name in ("source_m", "reference_m", "loudspeaker_m", "error_m")}
         placed = {name: as_number(x, name, unit="m") for name, x in positions.items() if x is not None}
@@ -129,9 +106,7 @@ class Duct:
             )
 
 
-def duct_plant(
-    duct: Duct | None = None, *, fs: float, primary_taps: int | None = None, secondary_taps: int | None = None
-) -> Plant:
+def duct_plant(duct: Duct | None = None, *, fs: float) -> Plant:
     r"""Return the two paths of a duct with reflecting ends, in which plane waves travel.
 
     All images of a source at :math:`x_s` sum up, at a microphone at :math:`x > x_s`, to
@@ -159,19 +134,17 @@ def duct_plant(
         The duct, by default ``Duct()``.
     fs : float
         Sample rate in Hz.
-    primary_taps, secondary_taps : int, optional
-        Lengths of the impulse responses; by default the smallest multiples of 64 that leave out no more than -50 dB of
-        their energy: 832 and 640 for the default duct. Given lengths may leave out -40 dB.
 
     Returns
     -------
     Plant
-        Primary and secondary path, with linear amplifiers.
+        Primary and secondary path, with linear amplifiers. Their lengths are the smallest multiples of 64 taps that
+        leave out no more than -50 dB of the energy.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is out of range, or a response does not decay within the taps.
+        If an argument is out of range, or a response rings too long.
 
     References
     ----------
@@ -205,13 +178,11 @@ def duct_plant(
     if duct.loudspeaker_resonance_hz is not None:
         relative = f / duct.loudspeaker_resonance_hz
         secondary *= -(relative**2) / (1 - relative**2 + 1j * relative / duct.loudspeaker_q)
-    return Plant(
-        _sampled(secondary, secondary_taps, "secondary_taps"), _sampled(primary, primary_taps, "primary_taps"), fs=fs
-    )
+    return Plant(_sampled(secondary, "secondary"), _sampled(primary, "primary"), fs=fs)
 
 
-def _sampled(response: np.ndarray, n_taps: int | None, name: str) -> np.ndarray:
-    """Return the impulse response of a response on the grid of `rfft`, band-limited and cut to `n_taps`."""
+def _sampled(response: np.ndarray, name: str) -> np.ndarray:
+    """Return the impulse response of a response on the grid of `rfft`, band-limited and cut where it has decayed."""
     position = np.linspace(0.0, 1.0, response.size)
     # With half a cosine from 0.4 fs to 0.5 fs, fractional delays ring only briefly.
     band_limit = np.where(position < 0.8, 1.0, 0.5 + 0.5 * np.cos(np.pi * (position - 0.8) / 0.2))
@@ -219,17 +190,10 @@ def _sampled(response: np.ndarray, n_taps: int | None, name: str) -> np.ndarray:
     # Share of the energy from each sample on. Ringing before time zero wraps around to the end of `taps`, and so counts
     # as left out.
     left_out = np.cumsum(taps[::-1] ** 2)[::-1] / np.sum(taps**2)
-    enough = 64 * -(-int(np.count_nonzero(left_out > _CHOSEN_CUT)) // 64)
-    chosen = enough if n_taps is None else as_count(n_taps, name)
-    if chosen > _N_FFT // 2:
+    enough = 64 * -(-int(np.count_nonzero(left_out > _CUT)) // 64)
+    if enough > _N_FFT // 2:
         raise ValueError(
-            f"{name} must not exceed {_N_FFT // 2}, but {chosen} are needed: the response rings too long, or "
+            f"the {name} path must not exceed {_N_FFT // 2} taps, but {enough} are needed: the response rings too long, or "
             "its wave arrives at once and rings before time zero; reflect less, attenuate more or delay more"
         )
-    if left_out[chosen] > _ALLOWED_CUT:
-        lost_db, allowed_db = 10 * np.log10(left_out[chosen]), 10 * np.log10(_ALLOWED_CUT)
-        raise ValueError(
-            f"{name} = {chosen} leaves out {lost_db:.1f} dB of the response's energy, more than "
-            f"{allowed_db:.0f} dB; leave it out for the default, which takes {enough}"
-        )
-    return taps[:chosen]
+    return taps[:enough]

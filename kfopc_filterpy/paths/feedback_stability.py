@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.polynomial.polynomial import polysub
 from numpy.typing import ArrayLike
 
 from .._taps import path_matrix
 from .._types import PathModels
 from .._validate import as_real_array
 from ..plant import Plant, as_constant_plant
-
-if TYPE_CHECKING:
-    import control
 
 _GRID = 2**16  # points around the unit circle; more for a loop of many taps
 _POINTS_PER_TAP = 64
@@ -78,21 +73,6 @@ class FeedbackMargin:
             f"{self.phase_margin_deg:.3g} degrees, least at {self.frequency_hz:.4g} Hz; path error "
             f"{100 * self.path_error:.3g} % at {self.path_error_hz:.4g} Hz>"
         )
-
-    @property
-    def loop(self) -> control.TransferFunction:
-        """Loop transfer function of one channel, in python-control's convention: ``1 / (1 + loop)`` is the sensitivity.
-
-        For acoustic feedback it is ``-w (f - f^)``. With several channels, it raises ValueError.
-        """
-        from control import TransferFunction
-
-        if any(taps.shape[:2] != (1, 1) for taps in self.paths):
-            raise ValueError("loop is that of one channel: with several, use path_error_at, or the filters in paths")
-        w, path, estimate = (taps[0, 0] for taps in self.paths)
-        above, below = np.convolve(w, path), polysub([1.0], np.convolve(w, estimate))
-        n = max(above.size, below.size)
-        return TransferFunction(*(np.pad(taps, (0, n - taps.size)) for taps in (above, below)), 1 / self.fs)
 
     def path_error_at(self, frequencies_hz: ArrayLike) -> np.ndarray:
         """Return the relative error of the path that the loop tolerates at each of `frequencies_hz`, (n_frequencies,).

@@ -20,14 +20,8 @@ if TYPE_CHECKING:
     import control
 
 
-def bandpass_path(
-    n_taps: int,
-    band: tuple[float, float] = (20.0, 5000.0),
-    *,
-    fs: float,
-    window: str | float | tuple[str, float] | tuple[str, float, float] = "hamming",
-) -> control.TransferFunction:
-    """Design a linear-phase band-pass path, the path model of the paper's simulations.
+def bandpass_path(n_taps: int, band: tuple[float, float] = (20.0, 5000.0), *, fs: float) -> control.TransferFunction:
+    """Design a linear-phase band-pass path with a Hamming window, the path model of the paper's simulations.
 
     The paper uses 20-5000 Hz with 128 taps (primary) and 32 taps (secondary). So few taps cannot realise an edge of
     20 Hz; `achieved_band` shows what they do realise.
@@ -41,8 +35,6 @@ def bandpass_path(
         `n_taps`.
     fs : float
         Sample rate in Hz; the paper's is 16000.
-    window : str or tuple, default "hamming"
-        Any window that `scipy.signal.get_window` knows.
 
     Returns
     -------
@@ -71,14 +63,10 @@ def bandpass_path(
     if high == fs / 2 and n_taps % 2 == 0:
         raise ValueError(f"n_taps must be odd for a band that reaches fs/2, got {n_taps}; use {n_taps + 1}")
     edges = [edge for edge in (low, high) if 0 < edge < fs / 2]
-    try:
-        taps = firwin(n_taps, edges, window=window, pass_zero=low == 0, fs=fs)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"window must be one that scipy.signal.get_window knows, got {window!r}") from error
-    return fir_path(taps, fs)
+    return fir_path(firwin(n_taps, edges, pass_zero=low == 0, fs=fs), fs)
 
 
-def fir_path(taps: ArrayLike, fs: float, name: str | None = None) -> control.TransferFunction:
+def fir_path(taps: ArrayLike, fs: float) -> control.TransferFunction:
     """Make a python-control system from an impulse response.
 
     Parameters
@@ -87,8 +75,6 @@ def fir_path(taps: ArrayLike, fs: float, name: str | None = None) -> control.Tra
         Impulse response, earliest sample first.
     fs : float
         Sampling rate in Hz.
-    name : str, optional
-        Name of the system.
 
     Returns
     -------
@@ -112,7 +98,7 @@ def fir_path(taps: ArrayLike, fs: float, name: str | None = None) -> control.Tra
     if not np.any(taps):
         raise ValueError("taps must not all be zero: such a path carries no sound")
     fs = as_positive(fs, "fs", unit="Hz")
-    return TransferFunction(taps, np.eye(1, taps.size)[0], 1 / fs, **({} if name is None else {"name": name}))
+    return TransferFunction(taps, np.eye(1, taps.size)[0], 1 / fs)
 
 
 def perturbed_path(

@@ -10,11 +10,10 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .._taps import finite_taps, path_taps, sampling_rate
 from .._types import PathModel
-from .._validate import as_signal
 from ..paths import analysis
 from . import style
 
@@ -31,21 +30,15 @@ def _named(paths: Any) -> dict[str, Any]:
     return {"path": paths}
 
 
-def _grid(frequencies_hz: Any, paths: Mapping[str, Any], fs: float | None) -> np.ndarray:
-    """Return the frequencies to draw: those given, or 2000 on a logarithmic scale from 20 Hz to fs/2."""
-    rates = {sampling_rate(path, fs, name=name) for name, path in paths.items()}
-    if frequencies_hz is not None:
-        return as_signal(frequencies_hz, "frequencies_hz", min_length=2)
-    if len(rates) > 1:
-        raise ValueError(f"frequencies_hz must be given for paths of differing sampling rates, {sorted(rates)} Hz")
-    nyquist = rates.pop() / 2
+def _grid(paths: Mapping[str, Any], fs: float | None) -> np.ndarray:
+    """Return 2000 frequencies on a logarithmic scale from 20 Hz to half the lowest sampling rate."""
+    nyquist = min(sampling_rate(path, fs, name=name) for name, path in paths.items()) / 2
     return np.geomspace(min(20.0, nyquist / 400), 0.999 * nyquist, 2000)
 
 
 def plot_bode(
     paths: PathModel | Mapping[str, PathModel],
     *,
-    frequencies_hz: ArrayLike | None = None,
     fs: float | None = None,
     ax: Sequence[Axes] | None = None,
 ) -> NDArray[Any]:
@@ -60,8 +53,6 @@ def plot_bode(
     paths : path, or mapping of str to path
         Paths by legend entry: ``{"P": primary, "S": secondary, "Ŝ": estimate}``. A path is a python-control system or
         an impulse response.
-    frequencies_hz : array_like, optional
-        Frequencies in Hz; by default 2000 from 20 Hz to fs/2.
     fs : float, optional
         Sampling rate in Hz, needed for tap arrays.
     ax : sequence of two matplotlib.axes.Axes, optional
@@ -88,7 +79,7 @@ def plot_bode(
     >>> plt.close(magnitude.figure)
     """
     named = _named(paths)
-    frequencies = _grid(frequencies_hz, named, fs)
+    frequencies = _grid(named, fs)
     magnitude, phase = axes = np.asarray(style.new_axes(ax, rows=2))
     powers = []
     for i, (label, path) in enumerate(named.items()):

@@ -34,10 +34,10 @@ class Curve(NamedTuple):
         """The first run."""
         return self.runs[0]
 
-    def stack(self, name: str, part: slice = slice(None), channel: int | None = None) -> np.ndarray:
+    def stack(self, name: str, channel: int | None = None) -> np.ndarray:
         """Return the signals `name` of the runs, (n_runs, n_samples) or, with all of several channels, 3-D."""
         signals = (getattr(run, name) for run in self.runs)
-        return np.stack([(x if channel is None else one_channel(x, channel))[..., part] for x in signals])
+        return np.stack([x if channel is None else one_channel(x, channel) for x in signals])
 
     def line(self) -> dict[str, Any]:
         """Return the label, with the time of a divergence, and the line style of a smooth curve."""

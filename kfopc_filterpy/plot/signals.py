@@ -27,9 +27,7 @@ def plot_error_spectra(
     results: Results,
     *,
     band: tuple[float, float] | None = None,
-    span_s: tuple[float, float] | None = None,
     segment_s: float = 0.128,
-    scaling: str = "density",
     channel: int | None = None,
     pascal_per_unit: ArrayLike | None = None,
     ax: Axes | None = None,
@@ -42,10 +40,8 @@ def plot_error_spectra(
         Runs with one disturbance; powers are averaged over several under a name.
     band : (float, float), optional
         Band to show in Hz, by default 0 to fs/2.
-    span_s : (float, float), optional
-        Start and end in seconds of the part to analyse, by default the second half.
-    segment_s, scaling
-        As for `power_spectrum_db`.
+    segment_s : float, default 0.128
+        As for `power_spectrum_db`, which looks at the second half.
     channel : int, optional
         Microphone to show, from 0; by default the mean power over all.
     pascal_per_unit : float or array_like, shape (K,), optional
@@ -85,14 +81,11 @@ def plot_error_spectra(
         scale, unit = pascals[:, np.newaxis] / SOUND_PRESSURE, "(20 µPa)²"
         scale = scale if channel is None else one_channel(scale, channel)
     low, high = as_band((0.0, fs / 2) if band is None else band, fs)
-    part, steady = (slice(None), 0.5) if span_s is None else (span_of(shown[0].run, span_s), 1.0)
     spectra = []
     for curve, name in [(shown[0], "disturbance"), *((curve, "error") for curve in shown)]:
-        signals = scale * curve.stack(name, part, channel)
+        signals = scale * curve.stack(name, channel)
         signals = signals.reshape(-1, signals.shape[-1])  # microphones are averaged like runs
-        frequencies, level = power_spectrum_db(
-            signals, fs, steady=steady, segment_s=segment_s, scaling=scaling, runs=True
-        )
+        frequencies, level = power_spectrum_db(signals, fs, segment_s=segment_s, runs=True)
         inside = (frequencies >= low) & (frequencies <= high)
         style = {"label": "Disturbance", **DISTURBANCE} if name == "disturbance" else curve.line()
         spectra.append((frequencies[inside], level[inside], style))
@@ -105,8 +98,7 @@ def plot_error_spectra(
         # The errors set the depth of the axis: the floor of the disturbance outside its band is of no interest.
         ax.set_ylim(max(np.min(np.concatenate(levels[1:]), initial=top) - 5, top - _DEPTH_DB), top + 5)
     ax.set_xlim(low, high)
-    power = f"Power per Hz (dB re {unit}/Hz)" if scaling == "density" else f"Power (dB re {unit})"
-    return labelled(ax, xlabel="Frequency (Hz)", ylabel=power)
+    return labelled(ax, xlabel="Frequency (Hz)", ylabel=f"Power per Hz (dB re {unit}/Hz)")
 
 
 def plot_anti_noise(

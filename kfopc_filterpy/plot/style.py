@@ -122,21 +122,21 @@ def phase_axis(ax: Axes, label: str) -> None:
     ax.set_ylabel(label)
 
 
-def labelled(ax: Axes, title: str | None = None, **labels: str) -> Axes:
-    """Give axes their labels, a grid and a legend with this title, and return them."""
+def labelled(ax: Axes, **labels: str) -> Axes:
+    """Give axes their labels, a grid and a legend, and return them."""
     ax.set(**labels)
     ax.grid(True, alpha=0.3)
-    return legend_above(ax, title)
+    return legend_above(ax)
 
 
-def legend_above(ax: Axes, title: str | None = None) -> Axes:
+def legend_above(ax: Axes) -> Axes:
     """Draw the legend above the axes, where it covers no curve, and return the axes."""
     labels = ax.get_legend_handles_labels()[1]
     # One row where it fits the width, for a longer one would squeeze the axes.
     width = sum(len(label) + 6 for label in labels)
     columns = len(labels) if width <= 75 else 2
     place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": columns}
-    ax.legend(**place, frameon=False, fontsize="small", title=title, title_fontsize="small")
+    ax.legend(**place, frameon=False, fontsize="small")
     return ax
 
 

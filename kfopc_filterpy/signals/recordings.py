@@ -58,21 +58,9 @@ class _Format(NamedTuple):
 
 _AUDIO_FILES = (".wav", ".wave", ".bwf", ".rf64", ".flac", ".aif", ".aiff", ".aifc")
 _REFUSED_AUDIO = (".m4a", ".aac", ".mp3", ".ogg", ".oga", ".opus", ".wma", ".w64", ".caf", ".au")  # with the remedy
-_AUDIO_HEADS = (
-    b"RIFF",
-    b"RIFX",
-    b"RF64",
-    b"BW64",
-    b"FORM",
-    b"fLaC",
-    b"OggS",
-    b"ID3",
-    b"\xff\xfb",
-    b"riff",
-    b"caff",
-    b".snd",
-)
-_AUDIO = _Format("an audio file", read_audio, _AUDIO_FILES + _REFUSED_AUDIO, _AUDIO_HEADS)
+_AUDIO_HEADS = (b"RIFF", b"RIFX", b"RF64", b"BW64", b"FORM", b"fLaC")
+_REFUSED_HEADS = (b"OggS", b"ID3", b"\xff\xfb", b"riff", b"caff", b".snd")
+_AUDIO = _Format("an audio file", read_audio, _AUDIO_FILES + _REFUSED_AUDIO, _AUDIO_HEADS + _REFUSED_HEADS)
 _MAT = _Format("a MAT file", read_mat, (".mat",), (b"MATLAB",), has_variables=True, holds_arrays=True)
 _TEXT = _Format("text", read_text, (".txt", ".csv", ".tsv", ".dat", ".asc", ".lvm", ".frd", ".zma"))
 _NPY = _Format("a .npy file", read_npy, (".npy",), (b"\x93NUMPY",), holds_arrays=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,6 @@ from ..plot import save_figure
 from ..signals import write_wav
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 HEADROOM = 4.0  # peak of a sound, over that of the first sound, beyond which it is clipped
@@ -89,24 +87,6 @@ class FigureItem:
         import matplotlib.pyplot as plt
 
         plt.close(self.figure)
-
-    @property
-    def alt(self) -> str:
-        """What is drawn, in words: the axes and the names of the curves."""
-        names = dict.fromkeys(
-            text for ax in self.figure.axes for text in ax.get_legend_handles_labels()[1] if not text.startswith("_")
-        )
-        drawn = dict.fromkeys(filter(None, (_axes_in_words(ax, self.figure.axes) for ax in self.figure.axes)))
-        curves = f". Curves: {'; '.join(names)}." if names else "."
-        text = f"Plot of {'; '.join(drawn)}{curves}" if drawn else ""
-        return re.sub(r"[${}\\]|\\mathrm", "", text)  # the marks of matplotlib's formulas
-
-
-def _axes_in_words(ax: Axes, others: Sequence[Axes]) -> str:
-    """Return an axes' labels; one that shares its time or frequency axis has the label of the lowest."""
-    below = next((own.get_xlabel() for own in [ax, *others] if own.get_xlabel()), "")
-    words = [ax.get_ylabel(), below] if ax.get_ylabel() else []
-    return " over ".join(" ".join(word.split()) for word in words if word)
 
 
 @dataclass(frozen=True)

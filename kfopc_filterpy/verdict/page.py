@@ -40,7 +40,7 @@ def inlined(item: FigureItem, file: Path) -> dict[str, Any]:
         image.convert("RGB").quantize(_COLOURS).save(small, "PNG", optimize=True)
         broad = image.width > 2 * image.height
     source = data_uri(small.getvalue(), "image/png")
-    return {"caption": item.caption, "alt": item.alt or item.caption, "source": source, "broad": broad}
+    return {"caption": item.caption, "source": source, "broad": broad}
 
 
 def players(

@@ -262,7 +262,7 @@ def _power_label(verdict: Assessment) -> str:
 def _checks(verdict: Assessment) -> dict[str, str]:
     """Return what was checked, and what was found, in words."""
     band, limits, late = verdict.band, verdict.limits, verdict.causality_margin_s
-    decided = [limits.decided_by] if isinstance(limits.decided_by, str) else dict.fromkeys(limits.decided_by)
+    decided = dict.fromkeys(one.decided_by for one in limits.each)
     causality, least = "unknown without a primary path", f"Least power for {verdict.want_db:g} dB"
     if verdict.feedback:
         causality = "the error microphone hears each control signal only after the delay of the secondary path"

@@ -36,7 +36,6 @@ def _peaks(plant, count):
 def test_lossless_resonances_are_the_closed_form(reflection, closed_form):
     duct = Duct(length_m=2.0, error_m=2.0, reflection=reflection, attenuation_db_per_m=0.0, **ENDS)
     expected = closed_form(np.arange(1, 9))
-    np.testing.assert_allclose(duct.resonances_hz(FS / 2)[:8], expected, rtol=1e-12)
     # 0.1 Hz: two steps of the frequency grid; the cut of the tail at -54 dB moves a peak by less.
     np.testing.assert_allclose(_peaks(duct_plant(duct, fs=FS), 8), expected, atol=0.1)
 
@@ -45,7 +44,7 @@ def test_wall_loss_lowers_resonances_by_its_dispersion():
     duct = Duct(length_m=2.0, error_m=2.0, reflection=(0.7, 0.7), **ENDS)
     peaks = _peaks(duct_plant(duct, fs=FS), 8)
     nepers = 1.0 / (20 * np.log10(np.e))
-    f = duct.resonances_hz(FS / 2)[:8]
+    f = np.arange(1, 9) * SPEED / (2 * 2.0)  # of the lossless duct
     # Phase over a round trip: 2 pi f 2L/c + 2L a sqrt(f/1000) = 2 pi n, solved to first order.
     expected = f - nepers * SPEED * np.sqrt(f / 1000) / (2 * np.pi)
     # 2 %: second order of a shift of up to 2 %, and the loss itself, which tilts the peaks.
@@ -123,12 +122,3 @@ def test_loudspeaker_is_a_second_order_high_pass(fs):
 def test_duct_refuses(arguments, message):
     with pytest.raises(ValueError, match=message):
         duct_plant(Duct(**arguments), fs=FS)
-
-
-def test_too_few_taps_are_refused_with_their_number():
-    with pytest.raises(ValueError, match=r"secondary_taps = 128 leaves out .* more than -40 dB; .* takes 640"):
-        duct_plant(fs=FS, secondary_taps=128)
-
-
-def test_anechoic_end_leaves_no_resonance():
-    assert Duct(reflection=(0.5, 0.0)).resonances_hz(FS / 2).size == 0

@@ -51,7 +51,6 @@ def arriving(primary, secondary, n_taps=64):
     ("call", "message"),
     [
         (lambda: frequency_response([1.0], [9000.0], fs=FS), "frequencies_hz must lie within 0 to fs/2"),
-        (lambda: achieved_band([1.0], 3.0, fs=FS), "level_db must be negative"),
         (lambda: secondary_path_gain([1.0], band=(1.0, 2.0), reference=[1.0]), "exclude each other"),
         (lambda: secondary_path_gain([1.0], band=(1.0, 2.0)), "fs must be given"),
         (lambda: secondary_path_gain([1.0, 1.0], reference=[1.0]), "reference must have at least 2"),
@@ -59,7 +58,6 @@ def arriving(primary, secondary, n_taps=64):
         (lambda: secondary_path_gain([1.0], reference=[0.0, 0.0]), "reference must not be silent"),
         (lambda: causality_margin(Plant([1.0], fs=FS)), "plant must have a primary path"),
         (lambda: causality_margin(Plant([1.0], [0.0], fs=FS)), "primary must not be silent"),
-        (lambda: causality_margin(Plant([1.0], [1.0], fs=FS), onset_share=1.0), "onset_share must be below 1"),
         (lambda: causality_margin(Plant([1.0], [1.0], fs=FS).changed_at(1.0, primary=[2.0])), "does not change"),
         (lambda: causality_margin(arriving([[9], [-1]], [[2], [3]])), r"primary\[1\] must not be silent"),
         (lambda: causality_margin(arriving([[9]], [[-1, -1]])), "secondary must not be silent"),
@@ -109,7 +107,6 @@ def test_achieved_band_of_a_known_response():
     band = achieved_band([0.5, 0.5], fs=FS)
     assert band.low_hz == 0.0
     assert band.high_hz == pytest.approx(np.arccos(10 ** (-3 / 20)) * FS / np.pi, abs=1e-3)
-    assert (band.peak_hz, band.peak_db) == (0.0, pytest.approx(0.0, abs=1e-12))
     highpass = achieved_band([0.5, -0.5], fs=FS)
     assert (highpass.low_hz + band.high_hz, highpass.high_hz) == (pytest.approx(FS / 2, abs=1e-3), FS / 2)
 
@@ -139,13 +136,10 @@ def test_an_unplugged_loudspeaker_does_not_decide_the_margin():
     assert repr(margin) == "<CausalityMargin of 2 microphone(s) and 2 loudspeaker(s): -0.5 ms, -8 samples>"
 
 
-@pytest.mark.parametrize("n_taps", [3, 64, 70_000])  # the last is longer than the grid's period of 65536
-def test_the_peak_of_a_band_is_that_of_the_response(n_taps):
-    taps = np.zeros(n_taps)
-    taps[[0, 1, -1]] = 0.5, 0.3, 0.4
-    band = achieved_band(taps, fs=FS)
-    at_peak = frequency_response(taps, [band.peak_hz], fs=FS)[0]
-    assert band.peak_db == pytest.approx(20 * np.log10(np.abs(at_peak)), abs=1e-9)
+def test_a_band_of_taps_beyond_the_grids_period_is_that_of_their_response():
+    taps = np.zeros(70_000)  # the grid has a period of 65536 samples
+    taps[[0, 65_536]] = 0.5, 0.5
+    assert achieved_band(taps, fs=FS) == achieved_band([1.0], fs=FS)
 
 
 def test_a_recording_taken_for_a_path_is_analysed_in_seconds():

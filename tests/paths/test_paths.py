@@ -17,21 +17,20 @@ FS = 16000.0
 
 
 @pytest.mark.parametrize(
-    ("n_taps", "band", "fs", "window", "pass_zero"),
+    ("n_taps", "band", "fs", "pass_zero"),
     [
-        (32, (20.0, 5000.0), 16000.0, "hamming", False),  # the paper's designs
-        (128, (20.0, 5000.0), 16000.0, "hamming", False),
-        (65, (0.0, 1000.0), 8000.0, "hann", True),
-        (65, (1000.0, 3500.0), 8000.0, ("kaiser", 6.0), False),
-        (65, (1000.0, 4000.0), 8000.0, "hamming", "highpass"),
+        (32, (20.0, 5000.0), 16000.0, False),  # the paper's designs
+        (128, (20.0, 5000.0), 16000.0, False),
+        (65, (0.0, 1000.0), 8000.0, True),
+        (65, (1000.0, 4000.0), 8000.0, "highpass"),
     ],
 )
-def test_bandpass_is_a_fir_design_by_its_window(n_taps, band, fs, window, pass_zero):
-    path = bandpass_path(n_taps, fs=fs) if fs == FS else bandpass_path(n_taps, band, fs=fs, window=window)
+def test_bandpass_is_a_fir_design_by_a_hamming_window(n_taps, band, fs, pass_zero):
+    path = bandpass_path(n_taps, fs=fs) if fs == FS else bandpass_path(n_taps, band, fs=fs)
     assert isinstance(path, control.TransferFunction)
     assert path.dt == 1 / fs
     edges = [edge for edge in band if 0 < edge < fs / 2]
-    expected = scipy.signal.firwin(n_taps, edges, window=window, pass_zero=pass_zero, fs=fs)
+    expected = scipy.signal.firwin(n_taps, edges, window="hamming", pass_zero=pass_zero, fs=fs)
     # The same design; python-control divides by a denominator of 1, which is exact.
     np.testing.assert_array_equal(path_taps(path), expected)
 
@@ -43,7 +42,6 @@ def test_bandpass_is_a_fir_design_by_its_window(n_taps, band, fs, window, pass_z
         ({"n_taps": 32, "band": 100.0}, "band must be a pair"),
         ({"n_taps": 32, "band": (0.0, 8000.0)}, "use fir_path"),
         ({"n_taps": 32, "band": (100.0, 8000.0)}, "n_taps must be odd .* use 33"),
-        ({"n_taps": 32, "window": "no such"}, "window must be one that"),
     ],
 )
 def test_bandpass_refuses(arguments, message):
@@ -60,9 +58,7 @@ def test_bandpass_refuses(arguments, message):
 def test_taps_survive_the_round_trip_through_a_system(taps, delay, tail):
     # Leading zeros, which python-control strips, are the delay and must come back.
     taps = np.concatenate([np.zeros(delay), taps, np.zeros(tail)])
-    path = fir_path(taps, FS, name="mine")
-    assert path.name == "mine"
-    np.testing.assert_array_equal(path_taps(path, fs=FS), taps)
+    np.testing.assert_array_equal(path_taps(fir_path(taps, FS), fs=FS), taps)
 
 
 def test_taps_of_an_array_are_padded_and_cut():

@@ -5,24 +5,11 @@ from __future__ import annotations
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from kfopc_filterpy.signals import read_recording
 from kfopc_filterpy.verdict.items import FigureItem, Sound, Table, loudness, write_files
 
 D = np.sin(np.arange(400) / 3)
-
-
-def test_words_for_a_figure():
-    drawn = Figure()
-    above, below = drawn.subplots(2, sharex=True)
-    above.plot([0, 1], label="KF-OPC")
-    below.plot([0, 1], label="_limit")
-    above.set_ylabel("error (dB)")
-    below.set(ylabel=r"factor $\alpha$", xlabel="time (s)")
-    alt = FigureItem("a", "Caption", drawn).alt
-    assert alt == "Plot of error (dB) over time (s); factor alpha over time (s). Curves: KF-OPC."
-    assert FigureItem("a", "Caption", Figure()).alt == ""
 
 
 def test_figures_held_for_the_report_are_unknown_to_pyplot():
