@@ -230,12 +230,7 @@ def feedback_paths(
 
 
 def path_matrix(
-    paths: PathModels,
-    *,
-    fs: float | None,
-    name: str,
-    axes: str = "(outputs, inputs, taps)",
-    n_taps: int | None = None,
+    paths: PathModels, *, fs: float | None, name: str, axes: str = "(outputs, inputs, taps)", n_taps: int | None = None
 ) -> tuple[np.ndarray, float | None]:
     """Return paths as taps (outputs, inputs, n_taps), and their sampling rate in Hz if systems tell it.
 

@@ -26,15 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ._types import NumberOrArray, PerLoudspeaker
-from ._validate import (
-    as_band,
-    as_number,
-    as_positive,
-    as_real_array,
-    as_sample_count,
-    as_signal,
-    require_channels_lead,
-)
+from ._validate import as_band, as_number, as_positive, as_real_array, as_sample_count, as_signal, require_channels_lead
 
 __all__ = [
     "CoherenceAndGain",
@@ -527,12 +519,7 @@ def coherence_and_gain(
 
 
 def power_spectrum_db(
-    signal: ArrayLike,
-    fs: float,
-    *,
-    steady: float = 0.5,
-    segment_s: float = 0.128,
-    runs: bool = False,
+    signal: ArrayLike, fs: float, *, steady: float = 0.5, segment_s: float = 0.128, runs: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the power spectral density by Welch's method, with a Hann window and half overlap.
 

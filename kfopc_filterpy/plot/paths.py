@@ -37,10 +37,7 @@ def _grid(paths: Mapping[str, Any], fs: float | None) -> np.ndarray:
 
 
 def plot_bode(
-    paths: PathModel | Mapping[str, PathModel],
-    *,
-    fs: float | None = None,
-    ax: Sequence[Axes] | None = None,
+    paths: PathModel | Mapping[str, PathModel], *, fs: float | None = None, ax: Sequence[Axes] | None = None
 ) -> NDArray[Any]:
     """Draw the magnitude and phase of paths over frequency in Hz.
 

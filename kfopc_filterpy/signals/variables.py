@@ -140,10 +140,7 @@ def _are_times(name: str, shape: tuple[int, ...], signal: tuple[int, ...]) -> bo
 
 
 def _name_of(
-    path: str | os.PathLike[str],
-    shapes: Mapping[str, tuple[int, ...]],
-    variable: str | None,
-    others: Mapping[str, str],
+    path: str | os.PathLike[str], shapes: Mapping[str, tuple[int, ...]], variable: str | None, others: Mapping[str, str]
 ) -> str:
     listed = [f"{name} {shape}" for name, shape in sorted(shapes.items())]
     more = f" and {len(listed) - LISTED} more" if len(listed) > LISTED else ""
