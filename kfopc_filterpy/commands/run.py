@@ -26,7 +26,7 @@ SMALL_BOUND_DB = 10.0  # below it, a shorter delay may be worth having
 
 EXAMPLES = """examples:
   kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --seconds 20
-  kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --clock real --block 32
+  kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --block 32
   kfopc run --device 3 --references 0 --errors 1 --outputs 0 --fs 16000 --rated-power 0.01 --amplitude-limit 0.5
   kfopc run --device 3 --errors 1 --feedback --fs 16000 --rated-power 0.01 --amplitude-limit 0.5
 
@@ -46,8 +46,6 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
         "--primary and --disturbance, there is no reference microphone: the recording is that of the error microphone"
     )
     parser.add_argument("--feedback", action="store_true", help=about)
-    about = "simulate as fast as possible, or in real time"
-    parser.add_argument("--clock", choices=("free", "real"), default="free", help=about)
     add_count(parser, "--latency", help="samples from writing to playing (default: two blocks)")
     parser.add_argument("--device", help="sound card, as `python -m sounddevice` lists it (default: the system's)")
     several: dict[str, Any] = {"minimum": 0, "nargs": "+"}
@@ -139,7 +137,6 @@ def _simulated(options: argparse.Namespace) -> SimulatedInterface:
         disturbance=noise if only_errors else disturbance,
         block=options.block,
         latency=options.latency,
-        clock=options.clock,
     )
 
 
@@ -199,7 +196,7 @@ def describe(status: RunStatus) -> str:
     reductions = " ".join(f"{r:5.1f}" for r in status.reduction_db)
     health = _counted(status.health) or "healthy"
     return (
-        f"{status.time_s:7.1f} s  reduction {reductions} dB  power {_powers(status)}  load {100 * status.load:.0f} %  "
+        f"{status.seconds:7.1f} s  reduction {reductions} dB  power {_powers(status)}  load {100 * status.load:.0f} %  "
         f"overruns {status.overruns}  {health}"
     )
 

@@ -1,4 +1,4 @@
-"""Whether a controller's adaptation has diverged: large weights, refused updates, a power that grows with the gain."""
+"""Whether a controller's adaptation has diverged: large weights, a power that grows with the gain."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ OVER_POWER = 4.0  # times the rated power over a window: no algorithm exceeds it
 PATIENCE = 3  # windows in a row that must be too loud: after a jump of the noise, the power needs some time
 OFTEN_LIMITED = 0.1  # of a window's samples at the limit
 GROWN = 1.5  # times the last normal gain: a filter that is louder with the same gain hears louder noise
-OFTEN_REFUSED = 0.1  # of a window's samples
 
 
 class Adaptation:
@@ -27,8 +26,6 @@ class Adaptation:
     ----------
     limited : ndarray, shape (J,)
         Samples of this window at the limit.
-    refused : int
-        Updates in this window that the controller has refused.
     """
 
     def __init__(self, n_loudspeakers: int, window: int) -> None:
@@ -43,7 +40,7 @@ class Adaptation:
     def begin(self) -> None:
         """Begin another window."""
         self._counted, self._energy = 0, np.zeros(self.n_loudspeakers)
-        self.limited, self.refused = np.zeros(self.n_loudspeakers), 0
+        self.limited = np.zeros(self.n_loudspeakers)
 
     def play(self, y: np.ndarray) -> bool:
         """Add control signals (J, n); return whether they complete a window, which is then to be judged."""
@@ -62,8 +59,6 @@ class Adaptation:
         gain = float(np.max(np.abs(np.atleast_1d(weights)).sum(axis=-1)))
         if not gain <= largest_gain:
             return "weights"
-        if self.refused > OFTEN_REFUSED * self._counted:
-            return "refused"
         if not self._is_loud(getattr(controller, "rated_power", None)):
             self._loud_windows, self._normal_gain = 0, gain
             return ""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .._types import Seed
-from .._validate import as_choice, as_count
+from .._validate import as_count
 from ..controllers.channel_samples import through
 from ..loop.inputs import SensorNoise
 from ..plant import Plant, Schedule, as_plant, checked_signals, schedule_of
@@ -87,14 +86,9 @@ class SimulatedInterface:
         Samples from a sample's reading to the playing of its control signal, at least a block; by default two blocks.
     rng : int or numpy.random.Generator, optional
         Seed of the sensor noise; required if there is any.
-    clock : {"free", "real"}, default "free"
-        Whether a block is there at once, or as in reality after its duration. With a real clock, blocks that are not
-        fetched in time are lost.
 
     Attributes
     ----------
-    total_plant : Plant
-        Plant at the beginning as a controller sees it, with the delay of the interface in its secondary path.
     disturbance : ndarray, shape (K, n_samples)
         Disturbance at the error microphones.
 
@@ -114,8 +108,6 @@ class SimulatedInterface:
     >>> first = interface.read()
     >>> first.references.shape, first.errors.shape
     ((1, 50), (1, 50))
-    >>> interface.total_plant  # 100 zeros, then the path
-    <Plant at 16000 Hz: secondary path of 102 taps, primary path of 3 taps>
     """
 
     def __init__(
@@ -127,33 +119,22 @@ class SimulatedInterface:
         block: int = 64,
         latency: int | None = None,
         rng: Seed | None = None,
-        clock: str = "free",
     ) -> None:
         self.fs = as_plant(plant).fs
         self.block = as_count(block, "block")
         self.latency = 2 * self.block if latency is None else as_count(latency, "latency")
         if self.latency < self.block:
             raise ValueError(f"latency must be at least a block, {self.block} samples, got {self.latency}")
-        self.clock = as_choice(clock, "clock", ("free", "real"))
         self._sensor_noise = SensorNoise(plant.sensor_noise_std, rng)
         self._x, self.disturbance = checked_signals(plant, reference, disturbance)
         self.n_references = len(self._x)
         self.n_microphones, self.n_loudspeakers = plant.n_microphones, plant.n_loudspeakers
-        begin = plant.at(0.0)
-        self.total_plant = Plant(
-            np.pad(begin.secondary, ((0, 0), (0, 0), (self.latency, 0))),
-            begin.primary,
-            feedback=begin.feedback,
-            amplifier=begin.amplifiers,
-            fs=self.fs,
-            sensor_noise_std=begin.sensor_noise_std,
-        )
         self._amplifiers = schedule_of(plant, "amplifier")
         self._secondary = _Paths(schedule_of(plant, "secondary"))
         feedback = schedule_of(plant, "feedback")
         self._feedback = None if feedback.values[0] is None else _Paths(feedback)
         self._queue = np.zeros((self.n_loudspeakers, self.latency))  # written, not yet played
-        self._done, self._began = 0, 0.0
+        self._done = 0
         self.blocks_can_repeat = False  # simulated noise may be exactly periodic
 
     @property
@@ -162,24 +143,10 @@ class SimulatedInterface:
         return self._x.shape[1]
 
     def start(self) -> None:
-        """Start the clock."""
-        self._began = time.perf_counter() - self._done / self.fs
+        """Do nothing: the next block is there at once."""
 
     def read(self) -> Block | None:
         """Return the next block; None if less than a block of the noise is left."""
-        lost = 0
-        if self.clock == "real":
-            wait = self._began + (self._done + self.block) / self.fs - time.perf_counter()
-            if wait > 0:
-                time.sleep(wait)
-            while -wait > self.block / self.fs and self._advance() is not None:
-                lost += self.block
-                wait += self.block / self.fs
-        heard = self._advance()
-        return None if heard is None else Block(*heard, lost)
-
-    def _advance(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return references and errors of the next block."""
         now = slice(self._done, self._done + self.block)
         if now.stop > self.n_samples:
             return None
@@ -189,7 +156,7 @@ class SimulatedInterface:
         x = self._x[:, now] + (0.0 if self._feedback is None else self._feedback(y))
         self._queue = np.concatenate((self._queue[:, self.block :], np.zeros((len(y), self.block))), axis=1)
         self._done = now.stop
-        return x, e
+        return Block(x, e)
 
     def _amplified(self, y: np.ndarray) -> np.ndarray:
         """Return the block `y`, (J, n), after the amplifiers, which are switched at the sample, as in `simulate`."""

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from .._types import PerLoudspeaker, Seed
-from .._validate import as_count, as_generator, as_nonnegative, as_positive, per_loudspeaker
+from .._types import PerLoudspeaker
+from .._validate import as_count, as_nonnegative, as_positive, per_loudspeaker
 from ..bounds.power_constrained import power_constrained_wiener
 from ..bounds.prediction import predictor_reference
 from ..bounds.settings import SuggestedSettings, suggest_settings
@@ -45,16 +45,14 @@ class FaultError(RuntimeError):
 
 @dataclass
 class RunStatus:
-    """How a run goes: levels, powers, load and health since the last report, handed to `on_report`.
+    """How a run goes: noise reduction, powers, load and health since the last report, handed to `on_report`.
 
     Attributes
     ----------
-    time_s : float
-        Seconds since the control was switched on.
+    seconds : float
+        Time since the control was switched on.
     reduction_db : ndarray, shape (K,)
         Error power before the control over the error power now, in dB, at each error microphone.
-    reference_level_db, error_level_db : ndarray, shape (I,), (K,)
-        Power of each microphone in dB relative to 1.
     powers : ndarray, shape (J,)
         Output power of each loudspeaker.
     rated_power : ndarray, shape (J,), or None
@@ -66,15 +64,13 @@ class RunStatus:
     lost : int
         Samples lost so far.
     underflows : int
-        Blocks so far that came too late for the output.
+        Blocks so far that came too late for the output. `health` has the times of those under control.
     health : Health
         Health record.
     """
 
-    time_s: float
+    seconds: float
     reduction_db: np.ndarray
-    reference_level_db: np.ndarray
-    error_level_db: np.ndarray
     powers: np.ndarray
     rated_power: np.ndarray | None
     load: float
@@ -85,21 +81,13 @@ class RunStatus:
 
 
 @dataclass
-class RunReport:
-    """What a run has done.
+class RunReport(RunStatus):
+    """What a run has done: as `RunStatus`, with reduction and powers over the second half, and more.
 
     Attributes
     ----------
-    seconds : float
-        Time under control.
     stopped_by : str
         "end" of the time or of the noise, "user", or the fault that ended it.
-    reduction_db : ndarray, shape (K,)
-        Noise reduction over the second half of the run, against the silence before it.
-    powers : ndarray, shape (J,)
-        Output power of each loudspeaker over that half.
-    rated_power : ndarray, shape (J,), or None
-        Rated powers of the controller.
     round_trip_samples : int or None
         Samples from a control signal to its arrival at the nearest error microphone, buffers included; None if the
         path was not identified.
@@ -108,32 +96,17 @@ class RunReport:
     possible_db : float
         Noise reduction that the best filter of `n_taps` taps reaches in the silence before the control; NaN if that was
         not checked.
-    overruns, blocks, lost : int
-        Blocks whose processing took longer than the block, all blocks, samples lost.
-    underflows : int
-        Blocks that came too late for the output. `health` has the times of those under control.
-    load : float
-        Largest share of a block's duration that its processing has taken.
-    health : Health
-        Health record.
+    blocks : int
+        Blocks under control.
     controller : Controller
         Controller at the end, which can be saved.
     """
 
-    seconds: float
     stopped_by: str
-    reduction_db: np.ndarray
-    powers: np.ndarray
-    rated_power: np.ndarray | None
     round_trip_samples: int | None
     secondary: PathEstimate | None
     possible_db: float
-    overruns: int
     blocks: int
-    lost: int
-    underflows: int
-    load: float
-    health: Health
     controller: Any = field(repr=False)
 
     def __repr__(self) -> str:
@@ -323,7 +296,6 @@ def run(
     on_report: Callable[[RunStatus], Any] | None = None,
     report_every_s: float = 0.25,
     should_stop: Callable[[], bool] | None = None,
-    rng: Seed = 0,
     **supervision: Any,
 ) -> RunReport:
     """Control noise in real time, from the identification of the plant to the fade-out at the end.
@@ -365,8 +337,6 @@ def run(
         Time between two reports in seconds.
     should_stop : callable, optional
         Called once for each block; the run ends when it returns True. Ctrl-C ends it too.
-    rng : int or numpy.random.Generator, default 0
-        Seed of the noise.
     **supervision
         Settings of the `Supervisor`, for example ``pause_s=1.0``.
 
@@ -415,7 +385,7 @@ def run(
     with _open(interface):
         silence = session.play(np.zeros((interface.n_loudspeakers, listen_n)))
         if not isinstance(controller, Controller):
-            identified = _identified(session, silence, level, limits, identify_s, n_path, as_generator(rng))
+            identified = _identified(session, silence, level, limits, identify_s, n_path)
     made = controller if isinstance(controller, Controller) else controller(identified)  # type: ignore[arg-type]
 
     known = {"full_scale": None, "blocks_can_repeat": True}
@@ -509,19 +479,18 @@ class _Watch:
     ) -> None:
         self._session, self._supervisor, self._on_report = session, supervisor, on_report
         self._every = max(round(every_s * supervisor.fs), 1)
-        counts = (supervisor.n_references, supervisor.n_microphones, supervisor.n_loudspeakers)
-        self._ends = np.cumsum(counts[:2])  # of the references and of the errors, behind the number of samples
         self._before = np.mean(silence.e**2, axis=1)
         self._parts: list[np.ndarray] = []  # each as `_new`
         self._part_samples = supervisor.fs
         self._samples = 0
-        self._nothing = np.zeros(1 + sum(counts))  # samples, energies of x, of e and of y
+        n_channels = supervisor.n_microphones + supervisor.n_loudspeakers
+        self._nothing = np.zeros(1 + n_channels)  # samples, energies of e and of y
         self._new = self._present = self._nothing  # since the last report, and of the present part
 
     def add(self, block: Any, y: np.ndarray) -> None:
         """Add a block, and report if it is time."""
-        signals = (block.references, block.errors, y)
-        sums = np.concatenate([[y.shape[1]], *(np.sum(np.square(_finite(one)), axis=1) for one in signals)])
+        energies = (np.sum(np.square(_finite(signals)), axis=1) for signals in (block.errors, y))
+        sums = np.concatenate([[y.shape[1]], *energies])
         self._samples += y.shape[1] + block.lost
         self._new, self._present = self._new + sums, self._present + sums
         if self._present[0] >= self._part_samples:
@@ -532,17 +501,15 @@ class _Watch:
                 self._parts = [a + b for a, b in zip(self._parts[::2], self._parts[1::2], strict=True)]
         if self._new[0] >= self._every:
             if self._on_report is not None:
-                self._on_report(self._status())
+                self._on_report(RunStatus(load=self._session.load_since_report, **self._figures(self._new)))
             self._new, self._session.load_since_report = self._nothing, 0.0
 
-    def _powers(self, sums: np.ndarray) -> list[np.ndarray]:
-        """Return the powers of the references, of the errors and of the control signals."""
-        return np.split(sums[1:] / max(sums[0], 1), self._ends)
-
-    def _figures(self, e: np.ndarray, y: np.ndarray) -> dict[str, Any]:
-        """Return what both reports state, of the powers of errors and control signals."""
+    def _figures(self, sums: np.ndarray) -> dict[str, Any]:
+        """Return what both reports state, of the sums over a stretch."""
+        e, y = np.split(sums[1:] / max(sums[0], 1), [self._before.size])
         rated = getattr(self._supervisor.controller, "rated_power", None)
         return {
+            "seconds": self._samples / self._supervisor.fs,
             "reduction_db": _db(self._before, e),
             "powers": y,
             "rated_power": None if rated is None else np.atleast_1d(rated),
@@ -552,23 +519,11 @@ class _Watch:
             "health": self._supervisor.health,
         }
 
-    def _status(self) -> RunStatus:
-        x, e, y = self._powers(self._new)
-        return RunStatus(
-            time_s=self._samples / self._supervisor.fs,
-            reference_level_db=_db(x, np.ones_like(x)),
-            error_level_db=_db(e, np.ones_like(e)),
-            load=self._session.load_since_report,
-            **self._figures(e, y),
-        )
-
     def report(self, stopped_by: str, identified: IdentifiedPlant | None, possible_db: float) -> RunReport:
         """Return the report of the whole run; its figures are those of the second half."""
         if self._present[0] or not self._parts:
             self._parts.append(self._present)
-        _, e, y = self._powers(np.sum(self._parts[len(self._parts) // 2 :], axis=0))
         return RunReport(
-            seconds=self._samples / self._supervisor.fs,
             stopped_by=stopped_by,
             round_trip_samples=None if identified is None else identified.round_trip_samples,
             secondary=None if identified is None else identified.path,
@@ -576,7 +531,7 @@ class _Watch:
             blocks=self._session.blocks,
             load=self._session.load,
             controller=self._supervisor.controller,
-            **self._figures(e, y),
+            **self._figures(np.sum(self._parts[len(self._parts) // 2 :], axis=0)),
         )
 
 
@@ -594,12 +549,11 @@ def _identified(
     limits: np.ndarray,
     identify_s: float,
     n_path: int | None,
-    rng: np.random.Generator,
 ) -> IdentifiedPlant:
     """Play noise from each loudspeaker in turn, and return what this tells about the plant."""
     interface = session.interface
     fs, n = interface.fs, round(identify_s * interface.fs)
-    noises = level * rng.standard_normal((interface.n_loudspeakers, n))
+    noises = level * np.random.default_rng(0).standard_normal((interface.n_loudspeakers, n))
     with session.without_gaps("the path was identified"):
         limited = np.clip(noises, -limits[:, np.newaxis], limits[:, np.newaxis])
         recordings = _recorded(session, limited, rest=round(0.1 * fs))

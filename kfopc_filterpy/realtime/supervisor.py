@@ -16,7 +16,7 @@ from ..checkpoint import Checkpointed
 from ..controllers.base import Controller, WrappedController, checked_controller
 from ..controllers.channel_samples import through
 from ..controllers.core_controller import CoreController
-from ..controllers.processing import RefusedUpdate, process_steps
+from ..controllers.processing import process_steps
 from ..paths.uncertainty import GUARD_TAPS
 from ..power.limiter import OutputLimiter
 from .adaptation import Adaptation
@@ -25,7 +25,6 @@ from .health import Health
 from .loudness import Loudness
 
 LONGEST_PAUSE = 64  # of the first pause
-MOST_REFUSALS = 3  # in a block; then the rest of it is not adapted to
 FORGOTTEN_S = 600.0  # without a divergence, after which the pauses are short again
 MOST_LOST = 2**53  # samples at once; many times as many are still a number that converts to a time
 MOST_DB = 100.0  # of louder noise: the square of a ratio of powers is still a number
@@ -108,10 +107,9 @@ class Supervisor(Checkpointed):
     - weights that are not finite, or larger than `largest_gain`;
     - in three windows in a row, a control signal of more than four times the controller's rated power, or one at its
       limit for a tenth of the time, from a control filter whose gain has grown;
-    - updates that the controller refuses for a tenth of the samples;
     - noise that is louder than before control, for example because a loudspeaker has the wrong polarity.
 
-    For the last one, it compares the power of the errors, the sum over the microphones, with that of the last silence.
+    An exception of the controller, such as a refused update, is a divergence too. For the louder noise, it compares the power of the errors, the sum over the microphones, with that of the last silence.
     If the references have become louder or softer since then, as much is expected of the errors, but no fall of more
     than 10 dB. If the mean over `louder_s` is `louder_db` above that, where each window counts at most twice as many
     dB, the loudspeakers fade out, and the supervisor listens for as long. If the noise is now softer by at least half
@@ -200,7 +198,6 @@ class Supervisor(Checkpointed):
         self._watched = ""  # what the present window is: "silence", "control", or nothing
         self._unusable = 0  # samples since the last usable one
         self._paused_for_input = False
-        self._last_y = np.zeros(self.n_loudspeakers)
         self._last_block: Any = None
         # The last samples that the controller wanted to play, and those that were played, as far as an internal model
         # remembers them.
@@ -469,43 +466,23 @@ class Supervisor(Checkpointed):
                 self._note("running again")
 
     def _adapted(self, x: np.ndarray, e: np.ndarray, adapt: np.ndarray) -> np.ndarray:
-        """Return the controller's outputs, (J, n); a sample that it refuses is counted, and the rest goes on."""
-        y, begin, n, refusals = np.zeros((self.n_loudspeakers, x.shape[1])), 0, x.shape[1], 0
+        """Return the controller's outputs, (J, n): zeros if it cannot go on."""
+        y = np.zeros((self.n_loudspeakers, x.shape[1]))
         process: Any = getattr(self.controller, "process", None) or partial(process_steps, self.controller)
-        with np.errstate(over="ignore", invalid="ignore"):
-            while begin < n:
-                room = np.zeros((self.n_loudspeakers, n - begin))
-                try:
-                    x_left, e_left = self._shaped(x[:, begin:]), self._shaped(e[:, begin:])
-                    process(x_left, e_left, adapt=adapt[begin:], out=self._shaped(room))
-                    done = n - begin
-                except RefusedUpdate as refused:
-                    done = refused.sample + 1
-                    self._note("refused", after=begin + refused.sample)
-                    self._adaptation.refused += 1
-                    refusals += 1
-                    if refusals == MOST_REFUSALS:
-                        self._adaptation.refused += int(np.count_nonzero(adapt[done + begin :]))
-                        adapt = np.zeros_like(adapt)
-                except Exception as error:  # noqa: BLE001 - whatever it is, the loudspeakers must not be left with it
-                    self._stop(f"diverged: {type(error).__name__}: {error}", at_once=True)
-                    return y
-                y[:, begin : begin + done] = room[:, :done]
-                begin += done
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                process(self._shaped(x), self._shaped(e), adapt=adapt, out=self._shaped(y))
+        except Exception as error:  # noqa: BLE001 - whatever it is, the loudspeakers must not be left with it
+            self._stop(f"diverged: {type(error).__name__}: {error}", at_once=True)
+            return np.zeros_like(y)
         return y
 
     def _finite(self, y: np.ndarray) -> np.ndarray:
-        """Return the control signals; from a value that is not finite on, the last finite one fades out, or 0."""
+        """Return the control signals, with zeros from a value that is not finite on."""
         finite = np.isfinite(y).all(axis=0)
         if not finite.all():
-            first = int(finite.argmin())
-            held = y[:, first - 1] if first else self._last_y
-            n = y.shape[1] - first
-            if _limiters(self.controller):  # which would not know of a fade
-                held = np.zeros_like(held)
-            y[:, first:] = held[:, np.newaxis] * np.clip(1.0 - np.arange(1, n + 1) / min(n, self._fade), 0.0, 1.0)
+            y[:, finite.argmin() :] = 0.0
             self._stop("diverged: not finite", at_once=True)
-        self._last_y = y[:, -1].copy()
         return y
 
     def _limit(self, y: np.ndarray) -> None:
@@ -582,8 +559,8 @@ class Supervisor(Checkpointed):
         self._listening, self._suspected = False, None
         self._adaptation.restart()
 
-    def _note(self, what: str, channel: str = "", *, after: int = 0, n_samples: int = 1) -> None:
-        begin = (self._samples + after) / self.fs
+    def _note(self, what: str, channel: str = "", *, n_samples: int = 1) -> None:
+        begin = self._samples / self.fs
         self.health.note(what, channel, time_s=begin, n_samples=n_samples, until_s=begin + n_samples / self.fs)
 
     def _shaped(self, block: np.ndarray) -> Any:
