@@ -229,7 +229,6 @@ def test_the_shortest_record_and_the_longest_filter_that_it_supports():
     ],
 )
 def test_no_setting_of_a_grid_is_better_by_half_a_decibel(path, noise):
-    """`python tests/helpers/settings_grid.py` tries all cases and longer filters."""
     found = compare(modelled_plants()[path], NOISES[noise], duration=2.0, lengths=(64, 128), factors=(0.01, 1.0, 100.0))
     assert np.all(found.own > found.best - 0.5), f"{found.own} against {found.best}"
     assert np.all(found.own[0] > 5.0)  # there is something to lose

@@ -12,7 +12,7 @@ from comparisons.bench import make_controller
 from comparisons.studies import amplifier, cases
 from comparisons.studies.amplifier import KNOWN, UNKNOWN, AmplifierRow, saturating, settings_for
 from comparisons.studies.cases import Case
-from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier
+from kfopc_filterpy import HardClipAmplifier
 from kfopc_filterpy.metrics import harmonics_db
 
 FS = 16000.0
@@ -48,17 +48,6 @@ def test_a_row_is_that_of_a_plain_run(small: Any, algorithm: str, known: str) ->
     assert row["harmonics_db"] == pytest.approx(harmonics_db(result.error, result.disturbance, 300.0, FS), abs=1e-6)
     asked = np.convolve(result.reference, result.weights[-1])[: result.error.size]
     assert row["asked_power"] == pytest.approx(np.mean(asked[asked.size // 2 :] ** 2), rel=1e-9)
-
-
-def test_known_amplifiers_reach_those_that_can_know_them(small: Any) -> None:
-    scene = small[1]
-    case = Case("duct", "tone", "soft saturation")
-    driven = saturating(scene, case, 6.0, KNOWN)
-    assert isinstance(driven.amplifier, SoftSaturationAmplifier)
-    assert driven.known_amplifier is driven.amplifier
-    assert driven.amplifier.limit == pytest.approx(np.sqrt(2 * 10**-0.6))
-    assert saturating(scene, case, 6.0, UNKNOWN).known_amplifier is None
-    assert amplifier.knowing() == ["KF-ANC", "KF-OPC", "KF-PB", "MOV-FxLMS"]
 
 
 def test_peak_limits_go_up_to_the_amplifiers(small: Any) -> None:

@@ -143,15 +143,6 @@ def test_the_unconstrained_control_power_is_one(scenes: Any) -> None:
         assert unconstrained_power(scene) == pytest.approx(1.0, rel=1e-6), noise
 
 
-@pytest.mark.parametrize("noise", NOISES)
-def test_a_case_is_what_it_says(scenes: Any, noise: str) -> None:
-    scene = scenes[noise]
-    d = duct_plant(fs=scene.fs).disturbance(scene.references[0])
-    np.testing.assert_allclose(scene.disturbances[0], d, rtol=0, atol=1e-12 * np.max(np.abs(d)))
-    assert scene.sensor_noise_std**2 / np.mean(d[8000:] ** 2) == pytest.approx(1e-4, rel=1e-9)  # 40 dB below
-    assert (scene.rated_power, scene.n_taps, scene.switch_on_s) == (1.0, 160, 0.5)
-
-
 def test_measured_data_join_where_they_are_at_hand(shared_data: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KFOPC_DATA", str(shared_data))
     cases.measured_data.cache_clear()

@@ -80,15 +80,6 @@ def test_a_path_changes_at_its_sample(plant: Any) -> None:
     assert np.allclose(d[at:], -one[at:], atol=1e-12)
 
 
-def test_events_say_where_they_happen() -> None:
-    found = {event.name: event for event in events.all_events()}
-    assert list(found) == ["20 dB louder", "20 dB softer", "sign", "delay", "longer duct", "one sweep", "sweeps"]
-    assert found["longer duct"].paths == ("duct",)
-    names = [(event.name, path) for event, path in events.jobs({"duct": None, "measured duct": None})]
-    assert len(names) == 13
-    assert ("longer duct", "measured duct") not in names
-
-
 def test_claims_from_rows_made_by_hand() -> None:
     def row(event: str, algorithm: str, **more: Any) -> TrackingRow:
         figures: dict[str, Any] = {"mean_nse_db": -5.0, "worst_window": 30.0, "settled_s": {"changed": 0.1}}

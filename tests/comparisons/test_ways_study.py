@@ -23,14 +23,3 @@ def test_every_way_has_a_line_below_the_bound() -> None:
         assert reduction_db < bound[0] + 0.2 or power > 1.0
     found = dict(zip(ways.WAYS, lines, strict=True))
     assert found["KF-PB"][1] == pytest.approx(1.0, abs=0.05)
-
-
-def test_without_the_data_a_line_says_why() -> None:
-    def unavailable(*_: str) -> None:
-        raise duct.DataUnavailableError("no file")
-
-    with smaller(duct, load_measured_duct=unavailable):
-        line = ways.at_hand("ways", "duct-measured")
-    assert line == (
-        "ways is left out: set KFOPC_DATA to a folder with the measured data, or run again with a network (no file)"
-    )

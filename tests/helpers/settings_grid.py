@@ -1,9 +1,4 @@
-"""Suggested settings against a grid of lengths and state noises: for tests, and as a command for all cases at hand.
-
-`python tests/helpers/settings_grid.py` takes a quarter of an hour. It prints for each path and noise by how many dB the best of
-the grid is better, in the noise reduction over the steady half and in the mean NSE over the whole run. The measured duct
-and the recordings take part if KFOPC_DATA names their folder.
-"""
+"""Suggested settings against a grid of lengths and state noises."""
 
 from __future__ import annotations
 
@@ -14,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from comparisons.bench.noises import bursty_noise, looped, swelling
-from comparisons.studies.cases import modelled_plants, of_unit_gain
+from comparisons.bench.noises import bursty_noise, swelling
 from kfopc_filterpy import Plant, kf_anc, kf_opc, simulate, suggest_settings
 from kfopc_filterpy.bounds import SuggestedSettings, wiener_solution
 from kfopc_filterpy.signals import band_limited_noise, compressor_noise, scaled_to_power, tone
@@ -109,40 +103,3 @@ def compare(
             if used <= 1.02 * max(power, rated):
                 best[1] = np.maximum(best[1], merits[1])
     return Comparison(suggested, own, best)
-
-
-def main() -> None:
-    """Print the table of all cases."""
-    from comparisons.bench.measured import DataUnavailableError, load_measured_duct
-
-    plants, noises = modelled_plants(), dict(NOISES)
-    try:
-        for name, apart_s in (("motor", 5.0), ("compressor", 8.0)):  # the run begins so much later in the recording
-            measured = load_measured_duct(name)
-            recording = measured.noise - measured.noise.mean()
-            noises[f"recorded {name}"] = lambda duration, seed, recording=recording, apart_s=apart_s: looped(
-                recording, duration, fs=FS, start_s=apart_s * (seed - 1)
-            )
-        plants["measured duct"] = of_unit_gain(measured)
-    except DataUnavailableError as error:
-        print(f"without the measured duct and the recordings: {error}")
-    print("dB by which the best of the grid is better: noise reduction, mean NSE")
-    worst = np.zeros((2, 2))
-    for path, plant in plants.items():
-        for name, noise in noises.items():
-            found = compare(
-                plant, noise, duration=4.5, lengths=(32, 64, 128, 256), factors=(0.01, 0.1, 1.0, 10.0, 100.0)
-            )
-            loss = found.best - found.own
-            worst = np.maximum(worst, loss)
-            taps, reduction = found.suggested.n_taps, found.own[0, 0]
-            print(
-                f"{path:13} {name:19} {taps:3} taps, KF-ANC reduces by {reduction:5.1f} dB: KF-ANC {loss[0, 0]:5.2f} "
-                f"{loss[0, 1]:5.2f}, KF-OPC {loss[1, 0]:5.2f} {loss[1, 1]:5.2f}",
-                flush=True,
-            )
-    print(f"at most: KF-ANC {worst[0, 0]:.2f} {worst[0, 1]:.2f}, KF-OPC {worst[1, 0]:.2f} {worst[1, 1]:.2f}")
-
-
-if __name__ == "__main__":
-    main()

@@ -369,6 +369,7 @@ def test_fades_are_smooth() -> None:
     [
         ({"amplitude_limit": 0.0}, "amplitude_limit must be greater than 0"),
         ({"full_scale": -1.0}, "full_scale must be greater than 0"),
+        ({"louder_db": 101.0}, "louder_db must be at most 100 dB, got 101; louder_s=None never listens"),
         ({"controller": object()}, "controller must have control_signal"),
         (
             {"controller": kf_opc(8, PATH, rated_power=1.0, fs=16000, state_noise=1e-6, measurement_noise=1e-2)},
