@@ -50,6 +50,7 @@ class Files:
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
         self.read: list[str] = []  # what was read, in words
+        self.units: dict[str, str] = {}  # that the files state
         self.remarks: list[str] = []  # on flaws of the recordings that resampling hides
         self._fs = 0.0  # of the files that were read; 0 before the first
         self._first = ""
@@ -131,6 +132,7 @@ class Files:
                 "example with --fs 16000"
             )
         self._fs, self._first = read.fs, self._first or path
+        self.units[path] = read.unit
         rate = "" if read.file_fs in (None, read.fs) else f" resampled from {read.file_fs:g} Hz"
         what = "taps" if is_path else "samples"
         self.read.append(f"{path}, {' x '.join(map(str, read.samples.shape))} {what} at {read.fs:g} Hz{rate}")
@@ -198,6 +200,20 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[np.ndarray, Pla
                 f"{len(disturbance)}: record all microphones together, or choose one, as in {options.disturbance}:0"
             )
     return noise, Plant(secondary, primary, fs=files.fs), disturbance
+
+
+def take_volts(options: argparse.Namespace, files: Files) -> None:
+    """Take the volts that secondary paths state, as in "Pa/V", for those of the control signal."""
+    stated = next((path for path in options.secondary if files.units[path].endswith("/V")), None)
+    given = options.volts_per_unit
+    if stated is None or (given is None and options.rated_power is not None and options.loudspeaker_watt is None):
+        return
+    if given is not None and set(given) != {1.0}:
+        raise ValueError(
+            f"{stated} is in {files.units[stated]}, so a control signal of 1 is 1 V, but --volts-per-unit is "
+            f"{', '.join(f'{one:g}' for one in given)}: leave it out"
+        )
+    options.volts_per_unit = [1.0]
 
 
 def _each(given: list[Any] | None, option: str, count: int, what: str) -> list[Any]:
@@ -295,5 +311,16 @@ def calibration_of(options: argparse.Namespace, files: Files, n_microphones: int
         option, pascals = "--calibrator", []
         for path in options.calibrator:
             pascals.append(calibration_factor(files.calibrator(path), options.calibrator_db))
+    errors = options.disturbance or options.noise
+    stated = {path: files.units[path].partition("/")[0] for path in (errors, *options.secondary) if path in files.units}
+    if options.disturbance is None and options.primary is not None:
+        del stated[errors]  # of the reference
+    units = {unit for unit in stated.values() if unit != "1"}
+    if len(units) > 1 or (pascals is not None and units and (units != {"Pa"} or set(pascals) != {1.0})):
+        is_in = ", ".join(f"{path} is in {files.units[path]}" for path, unit in stated.items() if unit != "1")
+        scale = "" if pascals is None else f", but {option} gives {', '.join(f'{one:.4g}' for one in pascals)} Pa for 1"
+        raise ValueError(f"{is_in}{scale}: the error microphones need one unit")
+    if units == {"Pa"}:
+        return 1.0
     each = _each(pascals, option, n_microphones, "microphone")
     return each[0] if pascals is None or len(pascals) == 1 else each

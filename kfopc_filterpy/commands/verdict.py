@@ -8,7 +8,7 @@ from functools import partial
 
 from .._validate import as_choice, as_nonnegative, as_number
 from .amplifiers import cheapest_enough
-from .inputs import Files, calibration_of, ratings_of, scene_of, uncertainty_of
+from .inputs import Files, calibration_of, ratings_of, scene_of, take_volts, uncertainty_of
 from .options import DONE, Parser, add_command, add_count, add_number, add_output, add_recorded_scene, prepare_output
 from .printing import progress_bar, say_written, tell
 
@@ -91,6 +91,7 @@ def verdict(options: argparse.Namespace) -> int:
     as_choice(options.algorithm, "--algorithm", CANDIDATES)
     files = Files(options)
     noise, plant, disturbance = scene_of(options, files)
+    take_volts(options, files)
     with progress_bar(options, "sample") as bar:
         assessed = partial(
             assess,

@@ -206,6 +206,26 @@ def test_the_rating_of_a_loudspeaker_counts_beside_that_of_the_amplifier(command
     assert found["decided_by"] == "loudspeaker's power"
 
 
+def test_units_that_files_state_count_and_are_not_contradicted(command, folder):
+    for name, unit in (("noise", "V"), ("d", "Pa"), ("S", "mPa/mV"), ("d", "V")):
+        scipy.io.savemat(
+            folder / f"{name}_{unit[0]}.mat", {"p": soundfile.read(folder / f"{name}.wav")[0], "fs": FS, "unit": unit}
+        )
+    scene = ["verdict", "noise_V.mat", "--secondary", "S_m.mat", "--watt", "10", "--ohm", "8", "--json", "--taps", "64"]
+    stated = json.loads(command(*scene, "--disturbance", "d_P.mat")[1])
+    plain = ["verdict", "noise.wav", "--disturbance", "d.wav", "--secondary", "S.wav", *scene[4:]]
+    given = json.loads(command(*plain, "--pascal-per-unit", "1", "--volts-per-unit", "1")[1])
+    assert stated | {"origin": None} == given | {"origin": None}
+    for more, message in (
+        (["d_P.mat", "--pascal-per-unit", "2.5"], "d_P.mat is in Pa, .*but --pascal-per-unit gives 2.5 Pa for 1"),
+        (["d_P.mat", "--volts-per-unit", "10"], "S_m.mat is in Pa/V, .* but --volts-per-unit is 10: leave it out"),
+        (["d_V.mat"], "d_V.mat is in V, S_m.mat is in Pa/V: the error microphones need one unit"),
+    ):
+        code, _, err = command(*scene, "--disturbance", *more)
+        assert code == 2
+        assert re.search(message, err)
+
+
 def test_channels_and_variables_are_named_with_their_files(command, folder):
     """Noise and disturbance in one sound file, and both paths in one .mat file, are as good as four files."""
     signals = {name: soundfile.read(folder / f"{name}.wav")[0] for name in ("noise", "d", "P", "S")}
