@@ -11,16 +11,13 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from kfopc_filterpy import OutputPowerConstraint, Plant, fx_lms, kf_opc
-from kfopc_filterpy.commands import main
 from kfopc_filterpy.realtime import Supervisor
-from kfopc_filterpy.signals import write_wav
 
 SECONDS = float(os.environ.get("FUZZ_SECONDS") or "0")
 FS = 8000.0
@@ -144,59 +141,3 @@ def test_a_plant_and_its_changes_are_refused_or_have_finite_paths_and_a_finite_d
         ):  # or sums overflow
             d, error = refused(lambda: plant.disturbance(x))  # noqa: B023 - called at once
             assert error is not None or np.isfinite(d).all(), (given, x)
-
-
-WORDS = [
-    *("verdict", "paths", "identify", "inspect", "run"),
-    *("noise.wav", "P.wav", "S.wav", "d.wav", "empty.wav", "text.wav", "zeros.wav"),
-    *("nan.npy", "stereo.wav", "tiny.csv"),
-    *("missing.wav", ".", "/dev/null", "", "é\u0000"[:1], "out.wav", "no/folder/out.wav", "out.xyz", "--", "-o"),
-    *("--primary", "--secondary", "--disturbance", "--fs", "--taps", "--memory", "--watt"),
-    *("--ohm", "--rated-power", "--want-db", "--volts-per-unit", "--peak-volts", "--json", "--algorithm", "--seconds"),
-    *("0", "-1", "1", "1e-300", "1e300", "1e400", "nan", "inf", "-inf", "8000", "8000.5", "0.1", "abc", "10" * 30),
-    *("KF-PB", "FxLMS", "KF-OPC,FxLMS", "--path-error-samples", "--no-such-option"),
-]
-# Complete commands that one word at a time is changed in; `run` is short, and `verdict` has so few taps that it is fast.
-SCENE = ["noise.wav", "--primary", "P.wav", "--secondary", "S.wav", "--rated-power", "0.1"]
-COMMANDS = [
-    ["paths", "inspect", "S.wav", "--primary", "P.wav", "--fs", "8000"],
-    ["paths", "inspect", "S.wav:0", "--fs", "4000"],
-    ["paths", "identify", "noise.wav", "d.wav", "--taps", "16", "-o", "S4.wav"],
-    ["verdict", *SCENE, "--ohm", "8", "--want-db", "nan"],
-    ["run", *SCENE, "--seconds", "nan"],
-]
-
-
-@pytest.fixture
-def folder(inside: Path) -> Path:
-    """A working folder with good and bad files."""
-    noise = np.random.default_rng(0).standard_normal(800)
-    files = {"noise": noise, "d": np.roll(noise, 3), "P": np.eye(16)[6], "S": np.eye(16)[2], "zeros": np.zeros(64)}
-    for name, samples in (files | {"stereo": np.stack((noise, noise))}).items():
-        write_wav(inside / f"{name}.wav", 0.2 * samples, 8000)
-    (inside / "empty.wav").write_bytes(b"")
-    (inside / "text.wav").write_text("these are words")
-    (inside / "tiny.csv").write_text("1\n")
-    np.save(inside / "nan.npy", np.full(8, np.nan))
-    return inside
-
-
-def test_a_wrong_command_is_told_in_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for rng in rounds(60):
-        arguments = list(COMMANDS[rng.integers(len(COMMANDS))])
-        for _ in range(rng.integers(1, 3)):
-            place = int(rng.integers(1, len(arguments) + 1))
-            word = WORDS[rng.integers(len(WORDS))]
-            if word in ("verdict", "run"):
-                continue  # a whole run takes longer than all the wrong ones
-            arguments[place : place + int(rng.integers(0, 2))] = [word]
-        try:
-            code = main(arguments)
-        except SystemExit as end:
-            code = end.code
-        err = capsys.readouterr().err
-        assert code in (0, 1, 2), arguments
-        if code == 2:
-            assert err.startswith("kfopc"), (arguments, err)
-            assert err.count("\n") == 1, (arguments, err)
-            assert len(err.split(": ", 1)[1].strip()) > 3, (arguments, err)

@@ -41,12 +41,12 @@ def demo(options: argparse.Namespace) -> int:
     """Write a reference, a disturbance, both paths and a controller: a compressor at 100 dB SPL in a duct."""
     from .. import Plant, simulate
     from ..paths import duct_plant
-    from ..signals import Compressor, compressor_noise, write_wav
+    from ..signals import compressor_noise, write_wav
     from .export import described
 
     duct, rng = duct_plant(fs=FS), np.random.default_rng(7)
-    flow = Compressor(bandwidth_hz=FS / 2)  # whose noise falls by 6 dB per octave
-    sound = compressor_noise(SECONDS, flow, fs=FS, rng=7, power=2.0**2)  # in Pa
+    # In Pa; the noise of the flow falls by 6 dB per octave up to fs/2.
+    sound = compressor_noise(SECONDS, fs=FS, rng=7, power=2.0**2, bandwidth_hz=FS / 2)
     primary, secondary = duct.primary[0, 0], duct.secondary[0, 0]  # type: ignore[index]
     signals = {
         "noise": sound + MICROPHONE_NOISE * rng.standard_normal(sound.size),

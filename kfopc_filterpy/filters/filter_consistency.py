@@ -13,7 +13,7 @@ from .._validate import as_count, as_number, as_real_array, require_finite
 
 @dataclass(frozen=True, repr=False)
 class Consistency:
-    """Tests of a filter, made by `consistency`; ``print(result)`` sums them up, and `plot_consistency` draws them.
+    """Tests of a filter, made by `consistency`; ``print(result)`` sums them up.
 
     Attributes
     ----------
@@ -110,7 +110,6 @@ def consistency(
     See Also
     --------
     fit_noise : the noises that explain a record best.
-    plot_consistency : a figure of the tests.
 
     Notes
     -----

@@ -1,4 +1,3 @@
-from .consistency import plot_consistency as plot_consistency
 from .paths import plot_bode as plot_bode
 from .paths import plot_impulse_responses as plot_impulse_responses
 from .runs import plot_nse as plot_nse

@@ -1,4 +1,3 @@
-from .generators import Compressor as Compressor
 from .generators import band_limited_noise as band_limited_noise
 from .generators import compressor_noise as compressor_noise
 from .generators import tone as tone

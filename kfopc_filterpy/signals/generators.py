@@ -7,12 +7,10 @@ Power is the mean square over the whole signal. For several channels, stack call
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from .._types import Seed
-from .._validate import as_band, as_count, as_generator, as_nonnegative, as_number, as_positive, as_sample_count
+from .._validate import as_band, as_generator, as_nonnegative, as_number, as_positive, as_sample_count
 from .shaping import scaled_to_power
 
 # The compressor's spectral envelope: a small shell radiates poorly below its peak, and forces fall above it.
@@ -22,7 +20,9 @@ _LOBE_GAIN_DB = 10.0
 _LINE_SPREAD_DB = 3.0
 # Load and speed of a machine wander over about half a second.
 _FLUCTUATION_TIME_S = 0.5
-_BROADBAND_FROM_HZ = 20.0
+_SPEED_FLUCTUATION, _LEVEL_FLUCTUATION = 0.003, 0.1  # standard deviations: of the speed, and of each log amplitude
+_N_HARMONICS, _LOBES = 40, 4  # multiples of the number of lobes stand out
+_BROADBAND_SHARE, _BROADBAND_FROM_HZ = 0.1, 20.0
 
 
 def tone(
@@ -121,84 +121,38 @@ def band_limited_noise(
     return scaled_to_power(shaped, power)
 
 
-@dataclass(frozen=True)
-class Compressor:
-    """Machine whose noise `compressor_noise` makes.
-
-    Attributes
-    ----------
-    shaft_hz : float, default 24.5
-        Mean shaft frequency: by default that of a four-pole induction motor on 50 Hz with 2 % slip.
-    n_harmonics : int, default 40
-        Number of shaft harmonics; all must stay below fs/2.
-    lobe_count : int, default 4
-        Lobes or vanes on the shaft: multiples of lobe_count * shaft_hz stand out. 1 treats all lines alike.
-    speed_fluctuation : float, default 0.003
-        Standard deviation of the speed, relative to its mean. 0 gives a constant speed.
-    level_fluctuation : float, default 0.1
-        Standard deviation of each line's log amplitude (0.1 is about 0.9 dB). 0 gives constant levels.
-    broadband_ratio : float, default 0.1
-        Share of the power that is broadband, from 0 up to but not including 1.
-    bandwidth_hz : float, default 2000.0
-        Upper edge of the broadband part in Hz, at most fs/2; its lower edge is 20 Hz.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If a value is not a number in its range.
-
-    Examples
-    --------
-    >>> Compressor(shaft_hz=25.0).lobe_count
-    4
-    """
-
-    shaft_hz: float = 24.5
-    n_harmonics: int = 40
-    lobe_count: int = 4
-    speed_fluctuation: float = 0.003
-    level_fluctuation: float = 0.1
-    broadband_ratio: float = 0.1
-    bandwidth_hz: float = 2000.0
-
-    def __post_init__(self) -> None:
-        as_positive(self.shaft_hz, "shaft_hz", unit="Hz")
-        as_count(self.n_harmonics, "n_harmonics")
-        as_count(self.lobe_count, "lobe_count")
-        as_nonnegative(self.speed_fluctuation, "speed_fluctuation")
-        as_nonnegative(self.level_fluctuation, "level_fluctuation")
-        if as_nonnegative(self.broadband_ratio, "broadband_ratio") >= 1:
-            raise ValueError(
-                f"broadband_ratio must be below 1, got {self.broadband_ratio:g}; "
-                "band_limited_noise makes noise without lines"
-            )
-        if as_positive(self.bandwidth_hz, "bandwidth_hz", unit="Hz") <= _BROADBAND_FROM_HZ:
-            raise ValueError(f"bandwidth_hz must be above {_BROADBAND_FROM_HZ:g} Hz, got {self.bandwidth_hz:g} Hz")
-
-
 def compressor_noise(
-    duration_s: float, machine: Compressor | None = None, *, fs: float, rng: Seed, power: float = 1.0
+    duration_s: float,
+    *,
+    fs: float,
+    rng: Seed,
+    power: float = 1.0,
+    shaft_hz: float = 24.5,
+    bandwidth_hz: float = 2000.0,
 ) -> np.ndarray:
     """Make compressor-like noise: harmonics of a slowly wandering shaft speed, and broadband flow noise.
 
-    This is the built-in stand-in for a recorded compressor. Line k lies at k times the shaft's frequency; all lines
-    follow the same speed, and each has a level of its own that wanders. Lines and broadband share a spectral envelope
-    that peaks at 250 Hz and falls by 6 dB per octave to both sides. Every `lobe_count`-th line stands 10 dB higher, as
-    pocket-passing lines do; single lines differ by 3 dB (standard deviation). Speed and levels wander as first-order
-    Gauss-Markov processes with a time constant of 0.5 s.
+    This is the built-in stand-in for a recorded compressor. Each of 40 lines lies at a multiple of the shaft's
+    frequency; all follow the same speed, and each has a level of its own that wanders. A tenth of the power is
+    broadband, from 20 Hz. Lines and broadband share a spectral envelope that peaks at 250 Hz and falls by 6 dB per
+    octave to both sides. Every fourth line stands 10 dB higher, as pocket-passing lines do; single lines differ by 3 dB
+    (standard deviation). The speed wanders by 0.3 % and the levels by 0.9 dB, as first-order Gauss-Markov processes with
+    a time constant of 0.5 s.
 
     Parameters
     ----------
     duration_s : float
         Duration in seconds.
-    machine : Compressor, optional
-        Speed, lines and broadband part, by default those of ``Compressor()``.
     fs : float
         Sampling frequency in Hz.
     rng : int or numpy.random.Generator
         Seed or generator.
     power : float, default 1.0
         Mean square of the signal, met exactly.
+    shaft_hz : float, default 24.5
+        Mean shaft frequency: by default that of a four-pole induction motor on 50 Hz with 2 % slip.
+    bandwidth_hz : float, default 2000.0
+        Upper edge of the broadband part in Hz, at most fs/2.
 
     Returns
     -------
@@ -214,27 +168,25 @@ def compressor_noise(
     Examples
     --------
     >>> import numpy as np
-    >>> x = compressor_noise(2.0, Compressor(shaft_hz=25.0), fs=16000, rng=1)
+    >>> x = compressor_noise(2.0, shaft_hz=25.0, fs=16000, rng=1)
     >>> x.shape, round(float(np.mean(x**2)), 12)
     ((32000,), 1.0)
     """
     n_samples = as_sample_count(duration_s, fs, "duration_s")
     generator = as_generator(rng)
-    machine = Compressor() if machine is None else machine
-    if machine.bandwidth_hz > fs / 2:
-        raise ValueError(f"bandwidth_hz must be at most fs/2 = {fs / 2:g} Hz, got {machine.bandwidth_hz:g} Hz")
+    shaft, upper = as_positive(shaft_hz, "shaft_hz", unit="Hz"), as_positive(bandwidth_hz, "bandwidth_hz", unit="Hz")
+    if not _BROADBAND_FROM_HZ < upper <= fs / 2:
+        raise ValueError(f"bandwidth_hz must be above {_BROADBAND_FROM_HZ:g} Hz and at most fs/2, got {upper:g} Hz")
     # Five standard deviations: a Gaussian speed exceeds them once in two million correlation times.
-    highest = machine.n_harmonics * machine.shaft_hz * (1 + 5 * machine.speed_fluctuation)
+    highest = _N_HARMONICS * shaft * (1 + 5 * _SPEED_FLUCTUATION)
     if highest >= fs / 2:
         raise ValueError(
-            f"n_harmonics = {machine.n_harmonics} lines of shaft_hz = {machine.shaft_hz:g} Hz reach {highest:g} Hz "
-            f"with the speed's fluctuation, beyond fs/2 = {fs / 2:g} Hz; lower n_harmonics or raise fs"
+            f"{_N_HARMONICS} lines of shaft_hz = {shaft:g} Hz reach {highest:g} Hz with the speed's fluctuation, beyond "
+            f"fs/2 = {fs / 2:g} Hz; lower shaft_hz or raise fs"
         )
-    share = machine.broadband_ratio
-    signal = scaled_to_power(_lines(machine, n_samples, fs, generator), 1 - share)
-    if share > 0:
-        signal = signal + scaled_to_power(_broadband(machine.bandwidth_hz, n_samples, fs, generator), share)
-    return scaled_to_power(signal, power)
+    lines = scaled_to_power(_lines(shaft, n_samples, fs, generator), 1 - _BROADBAND_SHARE)
+    broadband = scaled_to_power(_broadband(upper, n_samples, fs, generator), _BROADBAND_SHARE)
+    return scaled_to_power(lines + broadband, power)
 
 
 def _shaped_noise(gains: np.ndarray, n_samples: int, generator: np.random.Generator) -> np.ndarray:
@@ -248,18 +200,18 @@ def _envelope(frequencies: np.ndarray) -> np.ndarray:
     return 2 * relative / (1 + relative**2)
 
 
-def _lines(machine: Compressor, n_samples: int, fs: float, generator: np.random.Generator) -> np.ndarray:
+def _lines(shaft_hz: float, n_samples: int, fs: float, generator: np.random.Generator) -> np.ndarray:
     """Return the sum of the lines at the orders of the momentary speed, each with a wandering level."""
-    orders = np.arange(1, machine.n_harmonics + 1)
-    gain_db = _LOBE_GAIN_DB * (orders % machine.lobe_count == 0)
+    orders = np.arange(1, _N_HARMONICS + 1)
+    gain_db = _LOBE_GAIN_DB * (orders % _LOBES == 0)
     gain_db = gain_db + _LINE_SPREAD_DB * generator.standard_normal(orders.size)
-    amplitudes = _envelope(orders * machine.shaft_hz) * 10 ** (gain_db / 20)
-    speed = machine.shaft_hz * (1 + machine.speed_fluctuation * _slow_process(n_samples, fs, generator))
+    amplitudes = _envelope(orders * shaft_hz) * 10 ** (gain_db / 20)
+    speed = shaft_hz * (1 + _SPEED_FLUCTUATION * _slow_process(n_samples, fs, generator))
     shaft_phase = 2 * np.pi / fs * np.cumsum(speed)
     start = generator.uniform(0, 2 * np.pi, orders.size)
     total = np.zeros(n_samples)
     for order, amplitude, phase in zip(orders, amplitudes, start, strict=True):
-        level = np.exp(machine.level_fluctuation * _slow_process(n_samples, fs, generator))
+        level = np.exp(_LEVEL_FLUCTUATION * _slow_process(n_samples, fs, generator))
         total += amplitude * level * np.sin(order * shaft_phase + phase)
     return total
 

@@ -62,7 +62,7 @@ _AUDIO_HEADS = (b"RIFF", b"RIFX", b"RF64", b"BW64", b"FORM", b"fLaC")
 _REFUSED_HEADS = (b"OggS", b"ID3", b"\xff\xfb", b"riff", b"caff", b".snd")
 _AUDIO = _Format("an audio file", read_audio, _AUDIO_FILES + _REFUSED_AUDIO, _AUDIO_HEADS + _REFUSED_HEADS)
 _MAT = _Format("a MAT file", read_mat, (".mat",), (b"MATLAB",), has_variables=True, holds_arrays=True)
-_TEXT = _Format("text", read_text, (".txt", ".csv", ".tsv", ".dat", ".asc", ".lvm", ".frd", ".zma"))
+_TEXT = _Format("text", read_text, (".txt", ".csv", ".tsv", ".dat", ".asc", ".frd", ".zma"))
 _NPY = _Format("a .npy file", read_npy, (".npy",), (b"\x93NUMPY",), holds_arrays=True)
 _NPZ = _Format("a .npz file", read_npz, (".npz",), (b"PK\x03\x04",), has_variables=True, holds_arrays=True)
 _FORMATS = (_AUDIO, _MAT, _TEXT, _NPY, _NPZ)
@@ -165,7 +165,7 @@ def read_recording(
     level_db: float = 94.0,
     file_fs: float | None = None,
 ) -> Recording:
-    """Read a recording: WAV, RF64, FLAC, AIFF, MATLAB, .npy, .npz, text, CSV or LabVIEW's .lvm.
+    """Read a recording: WAV, RF64, FLAC, AIFF, MATLAB, .npy, .npz, text or CSV.
 
     The suffix of the file tells its format, or else how the file begins. Whole-number samples of audio files are scaled
     so that full scale is 1. In formats that hold arrays, the longer axis is time. A first column of text that rises

@@ -1,4 +1,4 @@
-"""Text: columns of numbers, with or without a time column, LabVIEW's .lvm, and impulse responses exported by REW."""
+"""Text: columns of numbers, with or without a time column, and impulse responses exported by REW."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ _TEKTRONIX = re.compile(
 )  # its header has three columns, beside those of times and samples
 _CLOCK = re.compile(r"\d:\d\d:\d\d")
 _REW = "* Impulse Response data saved by REW"
-_LABVIEW, _END_OF_HEADER = "LabVIEW Measurement", "***End_of_Header***"
 _LEAST_RISES = 10  # of a column that is no signal, between values that repeat
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _SECONDS = {"s": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}  # by the first letter of the unit
@@ -77,8 +76,6 @@ def read_text(path: str | os.PathLike[str]) -> Content:
     head = list(islice(_lines(path), _LONGEST_HEADER))
     if head and head[0].startswith(_REW):
         return _read_rew(path, head)
-    if head and head[0].startswith(_LABVIEW):
-        return _read_labview(path, head)
     table = _read_table(path)
     content = without_time(path, table)
     rounding = rounding_of(table.columns[:, 0]) / (np.ptp(table.columns[:, 0]) or 1.0)
@@ -274,33 +271,6 @@ def without_time(path: str | os.PathLike[str], table: Table) -> Content:
     factors, unit = _units(names[1:])
     fs = rate_of_step(step * unit_s, path, rounding_of(times) / np.ptp(times))
     return Content(columns[:, 1:] * factors, fs, unit, float(times[0] * unit_s))
-
-
-def _read_labview(path: str | os.PathLike[str], head: list[str]) -> Content:
-    """Return the channels of one segment of a LabVIEW measurement file, and the rate of its Delta_X."""
-    ends = [index for index, line in enumerate(head) if line.startswith(_END_OF_HEADER)]
-    n_segments = sum(line.startswith(_END_OF_HEADER) for line in _lines(path)) - 1
-    if len(ends) < 2 or n_segments != 1:
-        raise ValueError(
-            f"{path} is a LabVIEW measurement of {n_segments} segments, expected one: export a file for each"
-        )
-    delimiter = "," if any(line.startswith("Separator,Comma") for line in head) else "\t"
-    names, *fields = (line.rstrip().split(delimiter) for line in (head[ends[1] + 1], *head[: ends[1]]))
-    values = {field[0]: field[1:] for field in fields}
-    has_decimal_comma = values.get("Decimal_Separator") == [","]
-
-    def plain(line: str) -> str:
-        return line.replace(",", ".") if has_decimal_comma else line
-
-    steps, starts = ({float(plain(one)) for one in values.get(name, []) if one.strip()} for name in ("Delta_X", "X0"))
-    if len(steps) > 1 or len(starts) > 1:
-        raise ValueError(f"{path} holds channels of different rates or starts (Delta_X, X0): export a file for each")
-    channels = [index for index, name in enumerate(names) if name and not name.startswith(("X_Value", "Comment"))]
-    lines = map(plain, islice(_lines(path), ends[1] + 2, None))
-    columns = np.loadtxt(lines, delimiter=delimiter, usecols=channels, comments=None, ndmin=2)
-    fs = rate_of_step(steps.pop(), path) if steps else None
-    factors, unit = _units([f"({one})" for one in values.get("Y_Unit_Label", [])][: len(channels)])
-    return Content(columns * factors, fs, unit, starts.pop() if starts else 0.0)
 
 
 def _read_rew(path: str | os.PathLike[str], head: list[str]) -> Content:

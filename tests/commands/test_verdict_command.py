@@ -305,42 +305,6 @@ def test_without_a_reference_microphone_the_noise_is_that_of_the_ear(command, fo
     )  # whose stretches differ a bit
 
 
-@pytest.mark.parametrize("source", [["--primary", "P.wav"], ["--disturbance", "d.wav"]])
-def test_feedback_beside_a_reference_microphone_is_hybrid_control(command, source):
-    scene = ["noise.wav", *source, "--secondary", "S.wav", "--rated-power", "1", "--taps", "32", "--json"]
-    code, out, err = command("verdict", *scene, "--feedback")
-    assert code in (0, 1), err
-    data = json.loads(out)
-    jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
-    assert data["channels"] == {"references": 1, "loudspeakers": 1, "microphones": 1}
-    assert data["loop"]["stable"]
-    alone = json.loads(command("verdict", *scene)[1])
-    assert data["bound_db"] > min(alone["bound_db"], 60)  # the files have no noise that limits it
-    assert "loop" not in alone
-
-
-def test_without_a_reference_microphone_the_recording_is_that_of_all_error_microphones(command, several):
-    files = [
-        "--secondary",
-        "S1.wav",
-        "--secondary",
-        "S2.wav",
-        "--feedback",
-        "--rated-power",
-        "1",
-        "--taps",
-        "16",
-        "--json",
-    ]
-    code, out, err = command("verdict", "errors.wav", *files)
-    assert code in (0, 1), err
-    assert json.loads(out)["channels"]["references"] == 0
-    assert json.loads(out)["loop"]["path_error"] > 0
-    code, _, err = command("verdict", "noise.wav", *files)
-    assert code == 2
-    assert "a channel for each of the 2 microphone(s)" in err
-
-
 def test_a_settled_loop_that_a_measured_path_makes_unstable_is_refused(command, folder):
     """A path of the other sign: the loop's gain is then -2 T, and |T| is nearly 1 where the noise is."""
     write_wav(folder / "tone.wav", np.sin(0.5 * np.arange(24000)), FS)

@@ -76,11 +76,6 @@ def test_a_folder_imports_only_from_folders_before_it_in_the_list(layer):
     assert not wrong
 
 
-def test_the_reader_of_imports_finds_relative_and_public_ones():
-    assert set(imported(PACKAGE / "controllers" / "fxlms.py")) == {"controllers", "plant", "power"}
-    assert set(imported(PACKAGE / "verdict" / "candidates.py")) == {"bounds", "power", "verdict"}
-
-
 # The algorithm.
 
 CHECK = """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import inspect
 import re
 import sys
@@ -169,27 +168,6 @@ def test_every_argument_of_a_public_method_is_named_where_it_is_described():
             assert not missing, f"{name}.{method_name} leaves undescribed: {missing}"
 
 
-# Code fits its box in a window of 1300 pixels. A box has room for 124 columns on a page, 120 in the docstring of a function
-# or class, and 116 in that of a method.
-
-
-def test_code_on_a_page_is_no_wider_than_its_box():
-    for page in PAGES:
-        blocks = re.findall(r"^```([^\n]*)\n(.*?)^```", text_of(page), re.M | re.S)
-        code = [block for kind, block in blocks if not kind.startswith("{figure}")]
-        assert not [line for block in code for line in block.splitlines() if len(line) > 120], page
-
-
-def test_an_example_in_a_docstring_is_no_wider_than_its_box():
-    for name, thing in PUBLIC:
-        docs = [(inspect.getdoc(thing), 118)]
-        docs += [(inspect.getdoc(method), 114) for _, method in methods(thing) if inspect.isclass(thing)]
-        for doc, room in docs:
-            for example in doctest.DocTestParser().get_examples(doc or ""):
-                lines = [f">>> {line}" for line in example.source.splitlines()] + example.want.splitlines()
-                assert not [line for line in lines if len(line) > room], name
-
-
 # Figures of the pages.
 
 CELL = re.compile(r"^```\{code-cell\}.*?^```$", flags=re.M | re.S)
@@ -206,10 +184,3 @@ def test_every_figure_that_a_page_draws_has_a_caption_and_words_in_its_place():
         settings = cell.split("---")[1] if cell.count("---") >= 2 else ""
         assert re.search(r"^  figure:\n    caption: \|\n      \S", settings, flags=re.M), f"no caption:\n{cell}"
         assert re.search(r"^  image:\n    alt: \S", settings, flags=re.M), f"no alternative text:\n{cell}"
-
-
-def test_the_reader_of_cells_finds_those_that_draw():
-    drawn = "```{code-cell} python\nfigure, ax = plt.subplots()\n```"
-    hidden = "```{code-cell} python\n:tags: [remove-cell]\nplot_nse(run)\n```"
-    computed = "```{code-cell} python\nfrom kfopc_filterpy.plot import plot_nse\n```"
-    assert drawing_cells(f"{computed}\n\n{drawn}\n\n{hidden}") == [drawn]

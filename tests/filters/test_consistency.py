@@ -5,7 +5,6 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from filterpy.common import Saver
@@ -15,7 +14,6 @@ from scipy.stats import binom, chi2
 
 from kfopc_filterpy import KFOPC
 from kfopc_filterpy.filters import consistency
-from kfopc_filterpy.plot import plot_consistency
 
 # filterpy 1.4.5's `mahalanobis`, which a Saver asks for.
 pytestmark = pytest.mark.filterwarnings("ignore:Conversion of an array with ndim > 0:DeprecationWarning")
@@ -168,21 +166,3 @@ def saved(**other: Any) -> SimpleNamespace:
 def test_what_cannot_be_tested_is_refused(saver, arguments, error, message):
     with pytest.raises(error, match=message):
         consistency(saver, **arguments)
-
-
-def test_the_figure_shows_the_values_and_their_bounds():
-    saver, truth = tracked(np.random.default_rng(4), 60)
-    result = consistency(saver, truth=truth, max_lag=7)
-    nis, nees, correlation = axes = plot_consistency(result)
-    assert [ax.get_ylabel() for ax in axes] == ["NIS", "NEES", "Correlation"]
-    assert np.array_equal([line.get_ydata() for line in nis.get_lines()], [result.nis, *result.nis_bounds])
-    low, high = (np.full(60, bound) for bound in result.nees_bounds)
-    assert np.array_equal([line.get_ydata() for line in nees.get_lines()], [result.nees, low, high])
-    assert [bar.get_height() for bar in correlation.patches] == list(result.autocorrelation)
-    assert np.array_equal(correlation.get_lines()[1].get_ydata(), -result.autocorrelation_bounds)
-    with pytest.raises(ValueError, match="ax must be 3 axes"):
-        plot_consistency(result, ax=axes[:2])
-    assert plot_consistency(consistency(saver, max_lag=7), ax=axes[:2])[0] is nis
-    with pytest.raises(TypeError, match="result must be what consistency"):
-        plot_consistency(saver)
-    plt.close("all")

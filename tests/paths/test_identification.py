@@ -82,19 +82,6 @@ def test_estimate_refuses(sent, heard, message):
         estimate_path(sent, heard, 4, FS)
 
 
-def test_level_is_the_root_mean_square_of_the_excitation():
-    sent = []
-
-    def record(u):
-        sent.append(u)
-        return u
-
-    plant = Plant(PATH, amplifier=record)
-    identify_secondary_path(plant, n_taps=32, duration_s=2.0, rng=0, level=2.0)
-    # 32000 samples: a standard deviation of 0.4 %.
-    assert np.sqrt(np.mean(np.square(sent))) == pytest.approx(2.0, rel=0.02)
-
-
 SHORT_PATH = np.concatenate([np.zeros(3), np.random.default_rng(8).standard_normal(29) * np.exp(-np.arange(29) / 8)])
 TWO_BY_TWO = np.random.default_rng(9).standard_normal((2, 2, 24)) * np.exp(-np.arange(24) / 6)
 

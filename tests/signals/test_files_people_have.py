@@ -131,46 +131,6 @@ def test_columns_that_leave_rate_or_samples_open_are_refused(tmp_path, row, mess
         read_recording(tmp_path / "x.csv", fs=50000)
 
 
-def labview(x_columns="One", decimal=".", comment="", segments=1, delta="1.000000E-4\t1.000000E-4"):
-    """Return two channels as LabVIEW writes them, "Write To Measurement File" with one header."""
-    text = (
-        f"LabVIEW Measurement\t\nWriter_Version\t2\nSeparator\tTab\nDecimal_Separator\t{decimal}\nX_Columns\t{x_columns}\n"
-        "Time_Pref\tRelative\nDate\t2024/03/01\n***End_of_Header***\t\n\t\n"
-    )
-    rows = []
-    for n in range(3):
-        x = "" if x_columns == "No" else f"{n * 1e-4:.6f}"
-        between = [x] if x_columns == "Multi" else []
-        rows.append("\t".join([x, f"{n}.5", *between, f"-{n}.25", *([comment] if n == 0 and comment else [])]))
-    names = ["X_Value", "Left", *(["X_Value"] if x_columns == "Multi" else []), "Right", "Comment"]
-    segment = (
-        f"Channels\t2\t\t\nSamples\t3\t3\t\nX_Dimension\tTime\tTime\t\nX0\t0.0\t0.0\t\nDelta_X\t{delta}\t\n"
-        "***End_of_Header***\t\t\t\n" + "\t".join(names) + "\n" + "\n".join(rows) + "\n"
-    )
-    text += segment * segments
-    return text if decimal == "." else text.replace("0.", "0,").replace("1.", "1,").replace("2.", "2,")
-
-
-@pytest.mark.parametrize("x_columns", ["One", "No", "Multi"])
-@pytest.mark.parametrize("decimal", [".", ","])
-@pytest.mark.parametrize("comment", ["", "the fan # 2 starts"])
-def test_labview_is_read_with_its_rate(tmp_path, x_columns, decimal, comment):
-    (tmp_path / "x.lvm").write_text(labview(x_columns, decimal, comment))
-    recording = read_recording(tmp_path / "x.lvm")
-    assert recording.samples.tolist() == [[0.5, 1.5, 2.5], [-0.25, -1.25, -2.25]]
-    assert (recording.fs, recording.file_fs) == (10000, 10000)
-
-
-def test_labview_of_several_segments_or_rates_is_refused(tmp_path):
-    for settings, message in (
-        ({"segments": 3}, r"x\.lvm is a LabVIEW measurement of 3 segments, expected one: export a file for each"),
-        ({"delta": "1E-4\t2E-4"}, r"x\.lvm holds channels of different rates"),
-    ):
-        (tmp_path / "x.lvm").write_text(labview(**settings))
-        with pytest.raises(ValueError, match=message):
-            read_recording(tmp_path / "x.lvm")
-
-
 @pytest.mark.parametrize("read", [read_path, read_recording])
 @pytest.mark.parametrize(
     "header",

@@ -54,23 +54,6 @@ def test_a_file_without_a_known_suffix_is_known_by_how_it_begins(name, tmp_path)
     np.testing.assert_array_equal(read_recording(tmp_path / "recording.bin").samples, expected)
 
 
-@pytest.mark.parametrize(
-    ("width", "stored"),
-    [
-        (1, bytes([0, 128, 192])),
-        (2, struct.pack("<3h", -32768, 0, 16384)),
-        (3, b"\x00\x00\x80" + b"\x00\x00\x00" + b"\x00\x00\x40"),
-        (4, struct.pack("<3i", -(2**31), 0, 2**30)),
-    ],
-)
-def test_wav_by_another_writer_is_read(tmp_path, width, stored):
-    with wave.open(str(tmp_path / "x.wav"), "wb") as file:
-        file.setparams((1, width, 8000, 3, "NONE", ""))
-        file.writeframes(stored)
-    recording = read_recording(tmp_path / "x.wav")
-    assert (recording.samples.tolist(), recording.fs) == ([-1.0, 0.0, 0.5], 8000.0)
-
-
 @pytest.mark.parametrize(("shape", "kind"), [((5, 1), np.float64), ((1, 5), np.float32), ((5,), np.int16)])
 @pytest.mark.parametrize("write", [np.save, np.savez, lambda path, x: scipy.io.savemat(path, {"x": x})])
 def test_vectors_of_any_shape_and_type_are_read(tmp_path, shape, kind, write):

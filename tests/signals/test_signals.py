@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy.signals import Compressor, band_limited_noise, compressor_noise, scaled_to_power, tone
+from kfopc_filterpy.signals import band_limited_noise, compressor_noise, generators, scaled_to_power, tone
 
 FS = 16000
 # Rounding of a sum of 1e5 squares: far below 1e-12 relative.
@@ -39,54 +40,37 @@ def test_band_limited_noise_has_its_power_in_its_band_only():
         assert band_share(x, low, low + 450.0) == pytest.approx(0.25, rel=0.12)
 
 
-def test_band_limited_noise_is_gaussian():
-    x = band_limited_noise((200.0, 2000.0), 20.0, fs=FS, rng=5)
-    # About 2 * 1800 * 20 = 72000 independent values: standard errors of skewness and kurtosis are
-    # sqrt(6/72000) = 0.009 and sqrt(24/72000) = 0.018; five of them.
-    assert np.mean(x**3) == pytest.approx(0.0, abs=0.046)
-    assert np.mean(x**4) == pytest.approx(3.0, abs=0.092)
-    # Noise at a power of one exceeds the peak of a sine of that power, sqrt(2), 15.73 % of the time
-    # (erfc(1)).
-    assert np.mean(np.abs(x) > np.sqrt(2)) == pytest.approx(0.15730, abs=0.007)
-
-
 def test_band_limited_noise_takes_the_whole_band():
     x = band_limited_noise((0.0, FS / 2), 0.01, fs=FS, rng=1)
     white = np.random.default_rng(1).standard_normal(160)
     np.testing.assert_allclose(x, white / np.sqrt(np.mean(white**2)), rtol=0, atol=1e-13)
 
 
-def test_compressor_with_steady_speed_and_levels_is_a_sum_of_exact_harmonics():
-    x = compressor_noise(
-        2.0,
-        Compressor(shaft_hz=25.0, n_harmonics=6, speed_fluctuation=0.0, level_fluctuation=0.0, broadband_ratio=0.0),
-        fs=FS,
-        rng=1,
-        power=2.0,
-    )
-    assert np.mean(x**2) == pytest.approx(2.0, rel=EXACT)
-    # 25 Hz over 2 s lies on bin 50: the six lines hold all of the power, up to rounding.
-    energy = np.abs(np.fft.rfft(x)) ** 2
-    lines = energy[50 * np.arange(1, 7)]
-    assert np.all(lines > 1e-6 * energy.sum())
-    assert np.sum(lines) == pytest.approx(np.sum(energy), rel=1e-12)
+@pytest.fixture
+def steady(monkeypatch):
+    """A compressor of constant speed and levels without broadband noise."""
+    for name in ("_SPEED_FLUCTUATION", "_LEVEL_FLUCTUATION", "_BROADBAND_SHARE"):
+        monkeypatch.setattr(generators, name, 0.0)
+    monkeypatch.setattr(generators, "scaled_to_power", lambda x, power: scaled_to_power(x, power) if power else 0.0)
 
 
-def test_compressor_lobe_lines_stand_out():
-    steady = Compressor(shaft_hz=25.0, speed_fluctuation=0.0, level_fluctuation=0.0, broadband_ratio=0.0)
+def test_compressor_with_steady_speed_and_levels_is_a_sum_of_exact_harmonics_and_lobes_stand_out(steady):
     ratios = []
     for seed in range(40):
-        energy = np.abs(np.fft.rfft(compressor_noise(2.0, steady, fs=4000, rng=seed))) ** 2
+        x = compressor_noise(2.0, shaft_hz=25.0, fs=4000, rng=seed, power=2.0)
+        assert np.mean(x**2) == pytest.approx(2.0, rel=EXACT)
+        # 25 Hz over 2 s lies on bin 50: the lines hold all of the power, up to rounding.
+        energy = np.abs(np.fft.rfft(x)) ** 2
+        assert np.sum(energy[50 * np.arange(1, 41)]) == pytest.approx(np.sum(energy), rel=1e-12)
         # Orders 9 and 11 surround order 10, the peak of the envelope; 8 and 12 are lobe lines.
         ratios.append(10 * np.log10(energy[50 * 12] * energy[50 * 8] / (energy[50 * 9] * energy[50 * 11])) / 2)
     # 10 dB apart; four independent spreads of 3 dB, halved, over 40 seeds: standard error 0.5 dB.
     assert np.mean(ratios) == pytest.approx(10.0, abs=2.0)
 
 
-def test_compressor_broadband_share_and_band():
-    x = compressor_noise(
-        8.0, Compressor(broadband_ratio=0.25, speed_fluctuation=0.0, level_fluctuation=0.0, shaft_hz=25.0), fs=FS, rng=2
-    )
+def test_compressor_broadband_share_and_band(steady, monkeypatch):
+    monkeypatch.setattr(generators, "_BROADBAND_SHARE", 0.25)
+    x = compressor_noise(8.0, shaft_hz=25.0, fs=FS, rng=2)
     energy = np.abs(np.fft.rfft(x)) ** 2
     energy[25 * 8 * np.arange(1, 41)] = 0.0
     # The broadband part's own share of the 40 bins, and its correlation with the lines, are about 0.5 %.
@@ -94,24 +78,18 @@ def test_compressor_broadband_share_and_band():
     assert band_share(x, 19.9, 2000.1) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_compressor_speed_and_levels_wander_as_stated():
-    steady = {"broadband_ratio": 0.0, "n_harmonics": 1, "shaft_hz": 100.0, "bandwidth_hz": 1000.0}
-    seconds = 60.0
-    x = compressor_noise(seconds, Compressor(speed_fluctuation=0.01, level_fluctuation=0.0, **steady), fs=2000, rng=4)
-    # One line: its analytic signal's phase gives the momentary frequency.
-    spectrum = np.fft.fft(x)
-    spectrum[x.size // 2 :] = 0.0
-    frequency = np.diff(np.unwrap(np.angle(np.fft.ifft(spectrum))))[200:-200] * 2000 / (2 * np.pi)
-    # 60 s hold about 60 correlation times (2 * 0.5 s): 100 +- 1 Hz, mean within 5/sqrt(60), spread within 45
-    # %.
+@pytest.mark.parametrize(("name", "spread"), [("_SPEED_FLUCTUATION", 0.01), ("_LEVEL_FLUCTUATION", 0.1)])
+def test_compressor_speed_and_levels_wander_as_stated(steady, monkeypatch, name, spread):
+    monkeypatch.setattr(generators, "_N_HARMONICS", 1)
+    monkeypatch.setattr(generators, name, spread)
+    x = compressor_noise(60.0, shaft_hz=100.0, bandwidth_hz=1000.0, fs=2000, rng=4)
+    # One line: the phase of its analytic signal gives the momentary frequency, its magnitude the level.
+    analytic = scipy.signal.hilbert(x)
+    frequency = np.diff(np.unwrap(np.angle(analytic)))[200:-200] * 2000 / (2 * np.pi)
+    wandering = frequency / 100.0 if name == "_SPEED_FLUCTUATION" else np.log(np.abs(analytic))[200:-200]
+    # 60 s hold about 60 correlation times (2 * 0.5 s): the mean within 5/sqrt(60) spreads, the spread within 45 %.
     assert np.mean(frequency) == pytest.approx(100.0, abs=0.65)
-    assert np.std(frequency) == pytest.approx(1.0, rel=0.45)
-
-    x = compressor_noise(seconds, Compressor(speed_fluctuation=0.0, level_fluctuation=0.1, **steady), fs=2000, rng=4)
-    spectrum = np.fft.fft(x)
-    spectrum[x.size // 2 :] = 0.0
-    level = np.log(np.abs(np.fft.ifft(spectrum)))[200:-200]
-    assert np.std(level) == pytest.approx(0.1, rel=0.45)
+    assert np.std(wandering) == pytest.approx(spread, rel=0.45)
 
 
 @given(
@@ -138,11 +116,14 @@ def test_channels_are_scaled_by_one_gain():
         (lambda: band_limited_noise((200, 9000), 1.0, fs=FS, rng=1), ValueError, "band must satisfy"),
         (lambda: band_limited_noise((201, 210), 0.01, fs=FS, rng=1), ValueError, "too short for the band 201 to"),
         (lambda: band_limited_noise((200, 2000), 1.0, fs=FS, rng=None), TypeError, "rng must be a seed"),
-        (lambda: compressor_noise(1.0, Compressor(n_harmonics=400), fs=FS, rng=1), ValueError, "beyond fs/2"),
-        (lambda: Compressor(broadband_ratio=1.0), ValueError, "broadband_ratio must be"),
-        (lambda: Compressor(bandwidth_hz=20.0), ValueError, "bandwidth_hz must be above 20 Hz, got 20 Hz"),
-        (lambda: compressor_noise(1.0, Compressor(bandwidth_hz=9e3), fs=FS, rng=1), ValueError, "at most fs/2"),
-        (lambda: compressor_noise(0.001, Compressor(bandwidth_hz=500), fs=FS, rng=1), ValueError, "too short for"),
+        (lambda: compressor_noise(1.0, shaft_hz=200.0, fs=FS, rng=1), ValueError, "beyond fs/2"),
+        (
+            lambda: compressor_noise(1.0, bandwidth_hz=20.0, fs=FS, rng=1),
+            ValueError,
+            "bandwidth_hz must be above 20 Hz",
+        ),
+        (lambda: compressor_noise(1.0, bandwidth_hz=9e3, fs=FS, rng=1), ValueError, "at most fs/2, got 9000 Hz"),
+        (lambda: compressor_noise(0.001, bandwidth_hz=500, fs=FS, rng=1), ValueError, "too short for"),
         (lambda: scaled_to_power([0.0, 0.0], 1.0), ValueError, "signal must not be all zeros"),
         (lambda: scaled_to_power([1j], 1.0), TypeError, "signal must be a sequence of real numbers"),
     ],
