@@ -19,7 +19,7 @@ from kfopc_filterpy.bounds import (
     power_constrained_solution,
     wiener_solution,
 )
-from kfopc_filterpy.bounds.channel_bound import channel_record
+from kfopc_filterpy.bounds.wiener import full_stretch
 from kfopc_filterpy.controllers import Controller
 from kfopc_filterpy.plant import checked_references, has_one_channel
 from kfopc_filterpy.power.amplifiers import Amplifier
@@ -365,7 +365,7 @@ def reachable_solution(x: np.ndarray, d: np.ndarray, plant: Plant, n_taps: int) 
     if x.ndim == 1:
         with reachable_weights():
             return wiener_solution(x, plant, n_taps=n_taps, disturbance=d)
-    record = channel_record(x, d, plant.secondary, n_taps).full(plant.secondary.shape[2])
+    record = full_stretch(x, d, plant.secondary, n_taps)
     return record.solution(record.correlations().weights(ridge=CHANNEL_RIDGE * record.filtered_power))
 
 

@@ -1,7 +1,6 @@
 """The bound for several loudspeakers: the least error of fixed control filters within each one's rated power.
 
-The sum of the squared errors over the microphones is minimised. Control filters are (J, I, n_taps); signals have the
-channel as the first axis.
+The sum of the squared errors over the microphones is minimised. Control filters are (J, I, n_taps).
 """
 
 from __future__ import annotations
@@ -12,54 +11,12 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
-from scipy.signal import fftconvolve
-
-from .._validate import as_count
-from ..paths.least_squares import correlation_matrix, cross_correlation
-from .wiener import Record
 
 RIDGE = 1e-10  # of the mean energy of a tap: directions of the weights with less energy get no weight
 TOLERANCE = 1e-5  # relative, for a rated power that limits
 MISSED = 1e-3  # from which a rated power is not met
 ROUNDING = 1e-14  # relative rounding error of the dual function
 SOLUTIONS = 100  # at most; about ten are usual
-
-
-class ChannelStretch(Record):
-    """A record of several channels: x is (I, n + n_taps - 1), x' (K, J, I, n + n_taps - 1) and d (K, n)."""
-
-    def correlations(self) -> ChannelCorrelations:
-        """Return the correlations R_x' and r, summed over microphones, and R_x."""
-        of_filtered = np.asarray(sum(correlation_matrix(rows, self.n_taps) for rows in self._rows))
-        return ChannelCorrelations(of_filtered, correlation_matrix(self.x, self.n_taps), self.cross(), self.shape)
-
-    def cross(self) -> np.ndarray:
-        """Return r, the cross-correlation of d and x', summed over microphones."""
-        pairs = zip(self._rows, self.d, strict=True)
-        return np.sum([[cross_correlation(d, row) for row in rows] for rows, d in pairs], axis=0).ravel()
-
-    @property
-    def _rows(self) -> np.ndarray:
-        """Filtered references as (K, J I, n + n_taps - 1)."""
-        return self.filtered.reshape(len(self.filtered), -1, self.filtered.shape[-1])
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Shape of the control filters, (J, I, n_taps)."""
-        return self.filtered.shape[1], self.filtered.shape[2], self.n_taps
-
-    def control_signal(self, weights: np.ndarray) -> np.ndarray:
-        """Return the control signals, (J, n)."""
-        return np.array([_sum_of_convolutions(self.x, w) for w in weights])
-
-    def antinoise(self, weights: np.ndarray) -> np.ndarray:
-        """Return the anti-noise, (K, n)."""
-        filters = weights.reshape(-1, self.n_taps)
-        return np.array([_sum_of_convolutions(rows, filters) for rows in self._rows])
-
-
-def _sum_of_convolutions(signals: np.ndarray, filters: np.ndarray) -> np.ndarray:
-    return fftconvolve(signals, filters, mode="valid", axes=-1).sum(axis=0)
 
 
 @dataclass(frozen=True)
@@ -146,11 +103,3 @@ class ChannelCorrelations:
         if not step[free] @ excess > 0.0:
             step[free] = solved(0.5 * excess)
         return step
-
-
-def channel_record(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int) -> ChannelStretch:
-    """Return checked signals (I, n) and (K, n) of several channels, with silence before the first sample."""
-    n_taps = as_count(n_taps, "n_taps")
-    filtered = fftconvolve(x[np.newaxis, np.newaxis], secondary[:, :, np.newaxis], axes=-1)[..., : x.shape[1]]
-    past = [(0, 0), (n_taps - 1, 0)]
-    return ChannelStretch(np.pad(x, past), np.pad(filtered, [(0, 0), (0, 0), *past]), d, n_taps)

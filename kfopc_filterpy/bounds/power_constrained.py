@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PerLoudspeaker
+from .._types import PerLoudspeaker
 from .._validate import as_nonnegative, as_positive, as_sample_count, per_loudspeaker
 from ..metrics import overshoot
 from ..plant import Plant, as_constant_plant, checked_signals, has_one_channel
 from . import wiener
-from .channel_bound import ChannelStretch, channel_record
 
 
 @dataclass(frozen=True)
@@ -208,7 +207,7 @@ class PowerConstrainedWiener:
         stretch, power = self.whole.stretch, np.asarray(self.rated_power, dtype=np.float64)
         correlations: Any = stretch.correlations()
         for _ in range(50):
-            weights, penalty = weights_within(stretch, correlations, power if power.ndim else float(power))
+            weights, penalty = wiener.constrained_weights(stretch, correlations, power if power.ndim else float(power))
             y = stretch.control_signal(weights)
             peak = np.asarray(overshoot(y, self.rated_power, self.fs, window_s=window_s))
             # A loudspeaker that keeps the budget without a price needs no more power.
@@ -332,10 +331,10 @@ def power_constrained_wiener(
     as_constant_plant(plant, "power_constrained_wiener")
     x, d = checked_signals(plant, reference, disturbance)
     fs, record = plant.fs, record_of_any(x, d, plant, n_taps)
-    if isinstance(record, ChannelStretch):
-        rated_power = per_loudspeaker(rated_power, plant.n_loudspeakers, "rated_power")
-    else:
+    if record.one_channel:
         rated_power = as_positive(rated_power, "rated_power")
+    else:
+        rated_power = per_loudspeaker(rated_power, plant.n_loudspeakers, "rated_power")
     first = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
     n_samples = record.d.shape[-1]
     if n_samples - first < record.n_taps:
@@ -359,7 +358,10 @@ def power_constrained_wiener(
 
     over_record = solve(first, n_samples)
     whole, unconstrained, scaled = over_record
-    wiener.warn_of_loss(max(_losses_db(counted, whole, unconstrained, ridge)))
+    if counted.one_channel:
+        correlations = counted.correlations()
+        left_out = wiener.loss_db(counted, correlations, whole.weights, penalty=whole.penalty)
+        wiener.warn_of_loss(max(left_out, wiener.loss_db(counted, correlations, unconstrained.weights, ridge=ridge)))
     segments = zip(edges, [*edges[1:], n_samples], strict=True)
     each = [over_record] if len(edges) == 1 else [solve(start, stop) for start, stop in segments]
     return PowerConstrainedWiener(
@@ -432,27 +434,7 @@ def record_of_any(x: np.ndarray, d: np.ndarray, plant: Plant, n_taps: int) -> wi
     """Return the record of checked signals, (I, n) and (K, n): one channel has more exact solutions than several."""
     if has_one_channel(plant, x):
         return wiener.record_of(x[0], d[0], plant.secondary[0, 0], n_taps)
-    return channel_record(x, d, plant.secondary, n_taps)
-
-
-def _losses_db(counted: wiener.Record, whole: ControlFilter, unconstrained: ControlFilter, ridge: float) -> list[float]:
-    """Return `loss_db` of the bound and of the filter without a budget; it is not computed for several channels."""
-    if not isinstance(counted, wiener.Stretch):
-        return [0.0]
-    correlations = counted.correlations()
-    return [
-        wiener.loss_db(counted, correlations, whole.weights, penalty=whole.penalty),
-        wiener.loss_db(counted, correlations, unconstrained.weights, ridge=ridge),
-    ]
-
-
-def weights_within(
-    stretch: wiener.Record, correlations: Any, rated_power: NumberOrArray
-) -> tuple[np.ndarray, NumberOrArray]:
-    """Return the weights of the least error within the power of each loudspeaker, and their λ."""
-    if isinstance(stretch, wiener.Stretch):
-        return wiener.constrained_weights(stretch, correlations, rated_power)
-    return correlations.constrained_weights(rated_power)
+    return wiener.record_of(x, d, plant.secondary, n_taps)
 
 
 def _solve(
@@ -467,7 +449,7 @@ def _solve(
 
     times: dict[str, Any] = {"start_s": start_s, "end_s": end_s, "stretch": stretch}
     correlations: Any = stretch.correlations()
-    constrained = control_filter(*weights_within(stretch, correlations, rated_power))
+    constrained = control_filter(*wiener.constrained_weights(stretch, correlations, rated_power))
     free = control_filter(correlations.weights(ridge=ridge))
     if np.all(free.control_power <= rated_power):
         return constrained, free, free

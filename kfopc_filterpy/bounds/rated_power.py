@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from .._validate import as_choice, as_finite_array, per_loudspeaker
 from ..plant import Plant, as_constant_plant, checked_signals, has_one_channel
-from .channel_bound import ChannelCorrelations, channel_record
-from .wiener import reduction_db
+from .channel_bound import ChannelCorrelations
+from .wiener import record_of, reduction_db
 
 ROUNDING_DB = 1e-9  # tolerance above the largest attainable noise reduction: its last digit may have been rounded up
 
@@ -112,8 +112,8 @@ def required_rated_power(
         raise ValueError(f"noise_reduction_db must not be negative, got {wanted.min():g} dB")
     as_constant_plant(plant, "required_rated_power")
     x, d = checked_signals(plant, reference, disturbance)
-    record = channel_record(x, d, plant.secondary, n_taps).with_sound()
-    shares = per_loudspeaker(1.0 if proportions is None else proportions, record.shape[0], "proportions")
+    record = record_of(x, d, plant.secondary, n_taps).with_sound()
+    shares = per_loudspeaker(1.0 if proportions is None else proportions, plant.n_loudspeakers, "proportions")
     search = _ScaleSearch(record.correlations(), shares, float(np.sum(np.mean(record.d**2, axis=-1))))
     if beyond == "raise" and np.any(wanted > search.most_db + ROUNDING_DB):
         raise ValueError(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
@@ -15,9 +14,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .._types import NumberOrArray
 from .._validate import as_channels, as_count, as_nonnegative, as_positive, as_signal
 from ..paths.least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve
 from ..plant import Plant, as_constant_plant, checked_signals, has_one_channel
+from .channel_bound import ChannelCorrelations
 
 # A control power that exceeds the rated one by no more than this share of it counts as within it.
 BUDGET_TOLERANCE = 1e-12
@@ -277,10 +278,11 @@ class Correlations:
 
 
 @dataclass(frozen=True, eq=False)
-class Record(ABC):
+class Record:
     """Samples that control filters are fitted to.
 
-    The signals x and x' begin `n_taps` - 1 samples early, to fill the delay lines.
+    The signals x and x' begin `n_taps` - 1 samples early, to fill the delay lines. Of one channel, x, x' and d are
+    one-dimensional; of several, x is (I, n + n_taps - 1), x' (K, J, I, n + n_taps - 1) and d (K, n).
     """
 
     x: np.ndarray
@@ -288,17 +290,41 @@ class Record(ABC):
     d: np.ndarray
     n_taps: int
 
-    @abstractmethod
+    @property
+    def one_channel(self) -> bool:
+        """Whether the signals have no channel axis."""
+        return self.x.ndim == 1
+
+    @property
+    def _rows(self) -> np.ndarray:
+        """Filtered references as (K, J I, n + n_taps - 1)."""
+        return self.filtered.reshape(len(np.atleast_2d(self.d)), -1, self.filtered.shape[-1])
+
     def correlations(self) -> Any:
-        """Return the correlations R_x', R_x and r."""
+        """Return the correlations R_x' and r, summed over microphones, and R_x."""
+        of_filtered = np.asarray(sum(correlation_matrix(rows, self.n_taps) for rows in self._rows))
+        found = of_filtered, correlation_matrix(self.x, self.n_taps), self.cross()
+        if self.one_channel:
+            return Correlations(*found)
+        return ChannelCorrelations(*found, (*self.filtered.shape[1:3], self.n_taps))
 
-    @abstractmethod
+    def cross(self) -> np.ndarray:
+        """Return r, the cross-correlation of d and x', summed over microphones."""
+        pairs = zip(self._rows, np.atleast_2d(self.d), strict=True)
+        return np.sum([[cross_correlation(d, row) for row in rows] for rows, d in pairs], axis=0).ravel()
+
     def control_signal(self, weights: np.ndarray) -> np.ndarray:
-        """Return the control signal y = w*x."""
+        """Return the control signal y = w*x, with several channels (J, n)."""
+        if self.one_channel:
+            return np.convolve(self.x, weights, mode="valid")
+        return np.array([_sum_of_convolutions(self.x, w) for w in weights])
 
-    @abstractmethod
     def antinoise(self, weights: np.ndarray) -> np.ndarray:
-        """Return the anti-noise w*x'."""
+        """Return the anti-noise w*x', with several channels (K, n)."""
+        if self.one_channel:
+            return np.convolve(self.filtered, weights, mode="valid")
+        filters = weights.reshape(-1, self.n_taps)
+        return np.array([_sum_of_convolutions(rows, filters) for rows in self._rows])
 
     @property
     def filtered_power(self) -> float:
@@ -345,25 +371,10 @@ class Record(ABC):
         )
 
 
-class Stretch(Record):
-    """A record of one channel: x, x' and d are one-dimensional."""
+def _sum_of_convolutions(signals: np.ndarray, filters: np.ndarray) -> np.ndarray:
+    from scipy.signal import fftconvolve
 
-    def correlations(self) -> Correlations:
-        """Return the correlations R_x', R_x and r."""
-        of_filtered, of_x = (correlation_matrix(signal, self.n_taps) for signal in (self.filtered, self.x))
-        return Correlations(of_filtered, of_x, self.cross())
-
-    def cross(self) -> np.ndarray:
-        """Return r, the cross-correlation of d and x'."""
-        return cross_correlation(self.d, self.filtered)
-
-    def control_signal(self, weights: np.ndarray) -> np.ndarray:
-        """Return the control signal y = w*x."""
-        return np.convolve(self.x, weights, mode="valid")
-
-    def antinoise(self, weights: np.ndarray) -> np.ndarray:
-        """Return the anti-noise w*x'."""
-        return np.convolve(self.filtered, weights, mode="valid")
+    return np.asarray(fftconvolve(signals, filters, mode="valid", axes=-1).sum(axis=0))
 
 
 def one_channel(
@@ -380,22 +391,25 @@ def one_channel(
     return x[0], d[0], plant.secondary[0, 0]
 
 
-def record_of(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int) -> Stretch:
-    """Return copies of checked signals, with silence before the first sample."""
-    from scipy.signal import lfilter
+def record_of(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int) -> Record:
+    """Return copies of checked signals, with silence before the first sample; see `Record` for their shapes."""
+    from scipy.signal import fftconvolve, lfilter
 
     n_taps = as_count(n_taps, "n_taps")
-    past = np.zeros(n_taps - 1)
-    filtered = lfilter(secondary, 1.0, x)
-    record = Stretch(np.concatenate([past, x]), np.concatenate([past, filtered]), d.copy(), n_taps)
+    if x.ndim == 1:
+        filtered = lfilter(secondary, 1.0, x)
+    else:
+        filtered = fftconvolve(x[np.newaxis, np.newaxis], secondary[:, :, np.newaxis], axes=-1)[..., : x.shape[1]]
+    x, filtered = (np.pad(signal, [(0, 0)] * (signal.ndim - 1) + [(n_taps - 1, 0)]) for signal in (x, filtered))
+    record = Record(x, filtered, d.copy(), n_taps)
     for signal in (record.x, record.filtered, record.d):
         signal.flags.writeable = False
     return record
 
 
-def full_stretch(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int) -> Stretch:
+def full_stretch(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int) -> Record:
     """Return the samples at which the delay lines of w and s are full."""
-    return record_of(x, d, secondary, n_taps).full(secondary.size)
+    return record_of(x, d, secondary, n_taps).full(secondary.shape[-1])
 
 
 def mean_square(signal: np.ndarray) -> float:
@@ -410,16 +424,16 @@ def reduction_db(error_power: float, disturbance_power: float) -> float:
     return float(-10 * np.log10(max(error_power / disturbance_power, 1e-30)))
 
 
-def loss_db(
-    stretch: Stretch, correlations: Correlations, weights: np.ndarray, penalty: float = 0.0, ridge: float = 0.0
-) -> float:
+def loss_db(stretch: Record, correlations: Any, weights: np.ndarray, penalty: float = 0.0, ridge: float = 0.0) -> float:
     """Return by how many dB weights in the directions left out would lower the error, 0 if it does not matter.
 
-    With a penalty or a ridge, the error is that of the penalised problem. The signals themselves resolve weights that
+    Of several channels that is not known, and 0 as well. With a penalty or a ridge, the error is that of the penalised problem. The signals themselves resolve weights that
     their correlations do not: a QR decomposition of evenly spaced samples is compared with `weights` at those samples.
     """
     from scipy.linalg import lstsq
 
+    if not stretch.one_channel:
+        return 0.0
     values = np.linalg.eigvalsh(correlations.matrix(penalty, ridge))
     if values[0] > RANK_TOLERANCE * values[-1]:
         return 0.0
@@ -458,8 +472,12 @@ def warn_of_loss(loss: float, what: str = "the solution is not the least-squares
         )
 
 
-def constrained_weights(stretch: Stretch, correlations: Correlations, rated_power: float) -> tuple[np.ndarray, float]:
-    """Return the weights of the least error within the power, and their λ."""
+def constrained_weights(
+    stretch: Record, correlations: Any, rated_power: NumberOrArray
+) -> tuple[np.ndarray, NumberOrArray]:
+    """Return the weights of the least error within the power of each loudspeaker, and their λ."""
+    if not stretch.one_channel:
+        return correlations.constrained_weights(rated_power)
     weights, penalty = np.zeros(stretch.n_taps), 0.0
     if correlations.balance > 0:
         weights, penalty = _least_penalty(correlations, rated_power)

@@ -9,9 +9,14 @@ import numpy as np
 
 from kfopc_filterpy import Plant
 from kfopc_filterpy.bounds import required_rated_power
-from kfopc_filterpy.bounds.channel_bound import ChannelStretch, channel_record
-from kfopc_filterpy.bounds.power_constrained import weights_within
-from kfopc_filterpy.bounds.wiener import Stretch, full_stretch, loss_db, reduction_db, warn_of_loss
+from kfopc_filterpy.bounds.wiener import (
+    Record,
+    constrained_weights,
+    full_stretch,
+    loss_db,
+    reduction_db,
+    warn_of_loss,
+)
 
 from .._types import NumberOrArray
 
@@ -45,17 +50,12 @@ class FixedFilters:
         Samples by which the anti-noise is late: a look-ahead to be tried beside those of the filter's length.
     """
 
-    stretch: Stretch | ChannelStretch
-
     def __init__(self, x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float, late: int = 0) -> None:
         past = s.shape[-1] + n_taps - 2  # samples that fill the delay lines
         first = max(x.shape[-1] // 2 - past, 0)
         self.x, self.d, self.s, self.n_taps, self.fs = x[..., first:], d[..., first:], s, n_taps, fs
         self.several = s.ndim == 3
-        if self.several:
-            self.stretch = channel_record(self.x, self.d, s, n_taps).full(s.shape[-1])
-        else:
-            self.stretch = full_stretch(self.x, self.d, s, n_taps)
+        self.stretch = full_stretch(self.x, self.d, s, n_taps)
         self.correlations: Any = self.stretch.correlations()
         self.free = self.stretch.solution(self.correlations.weights())
         self.filter_db = self.free.noise_reduction_db
@@ -66,7 +66,7 @@ class FixedFilters:
     def _ahead_db(self, samples: int) -> float:
         """Return the noise reduction of a filter that knows the reference so many samples ahead."""
         own = self.stretch
-        later: Any = type(own)(
+        later = Record(
             own.x[..., samples:], own.filtered[..., samples:], own.d[..., : own.d.shape[-1] - samples], self.n_taps
         )
         return later.solution(replace(self.correlations, cross=later.cross()).weights()).noise_reduction_db
@@ -77,7 +77,7 @@ class FixedFilters:
 
     def limited(self, rated_power: NumberOrArray) -> tuple[np.ndarray, float]:
         """Return the filter within the rated power, and its noise reduction in dB."""
-        weights, _ = weights_within(self.stretch, self.correlations, rated_power)
+        weights, _ = constrained_weights(self.stretch, self.correlations, rated_power)
         return weights, self.stretch.solution(weights).noise_reduction_db
 
     def within(self, rated_power: NumberOrArray) -> float:
@@ -86,10 +86,9 @@ class FixedFilters:
         Of several channels that is not known.
         """
         own = self.correlations
-        weights, penalty = weights_within(self.stretch, own, rated_power)
-        if isinstance(self.stretch, Stretch):
-            losses = loss_db(self.stretch, own, weights, penalty), loss_db(self.stretch, own, self.free.weights)
-            warn_of_loss(max(losses))
+        weights, penalty = constrained_weights(self.stretch, own, rated_power)
+        losses = loss_db(self.stretch, own, weights, penalty), loss_db(self.stretch, own, self.free.weights)
+        warn_of_loss(max(losses))
         return self.stretch.solution(weights).noise_reduction_db
 
     def needed(self, noise_reduction_db: float, rated_power: NumberOrArray) -> NumberOrArray:
@@ -118,7 +117,7 @@ class FixedFilters:
         unit, given, steps = (rated_power, 1.0, CHANNEL_CURVE) if self.several else (1.0, rated_power, CURVE)
         own, full = self.correlations, np.max(self.free.control_power / unit)
         powers = np.unique([*steps * full, *NEARLY_FULL * full, given, given / 2, given * 2])
-        removed = np.array([own.antinoise(weights_within(self.stretch, own, one * unit)[0]) for one in powers])
+        removed = np.array([own.antinoise(constrained_weights(self.stretch, own, one * unit)[0]) for one in powers])
         microphones = len(np.atleast_2d(self.d))
         left = self.free.disturbance_power - removed / microphones
         return powers, np.array([reduction_db(one, self.free.disturbance_power) for one in left])
