@@ -35,7 +35,7 @@ class ControlFilter(wiener.WienerSolution):
         α, as in KF-OPC; 1 for filters that are not scaled.
     start_s, end_s : float
         Start and end of the stretch in seconds from the first sample that counts.
-    stretch : Stretch
+    stretch : Record
         Samples of the stretch.
     """
 
@@ -76,11 +76,6 @@ class ControlFilters:
     weights = _of_each("weights", "Weights of each segment, shape (n_segments, n_taps).")
     penalty = _of_each("penalty", "λ of each segment, shape (n_segments,).")
     control_power = _of_each("control_power", "Mean square of y in each segment, shape (n_segments,).")
-    error_power = _of_each("error_power", "Mean square of e in each segment, shape (n_segments,).")
-    segment_noise_reduction_db = _of_each(
-        "noise_reduction_db", "Noise reduction of each segment in dB, shape (n_segments,); NaN without a disturbance."
-    )
-    start_s = _of_each("start_s", "Start of each segment in s from the first sample that counts, shape (n_segments,).")
 
     @property
     def noise_reduction_db(self) -> float:
@@ -322,8 +317,8 @@ def power_constrained_wiener(
     4.8, 0.500, 0.93
     >>> bound.per_second.control_power.round(6)
     array([0.5, 0.5, 0.5, 0.5])
-    >>> bound.per_second.segment_noise_reduction_db.round(1)
-    array([9.2, 8.6, 4.4, 4.3])
+    >>> [round(segment.noise_reduction_db, 1) for segment in bound.per_second.segments]
+    [9.2, 8.6, 4.4, 4.3]
     >>> {name: round(value, 1) for name, value in bound.noise_reduction_over(start_s=2.0).items()}
     {'whole': 5.6, 'per_second': 4.4, 'unconstrained': 16.0, 'scaled': 3.3, 'scaled_per_second': 2.5}
     """

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validate import as_choice, as_finite_array, per_loudspeaker
+from .._validate import as_finite_array, per_loudspeaker
 from ..plant import Plant, as_constant_plant, checked_signals, has_one_channel
 from .channel_bound import ChannelCorrelations
 from .wiener import record_of, reduction_db
@@ -47,7 +47,6 @@ def required_rated_power(
     n_taps: int,
     disturbance: ArrayLike | None = None,
     proportions: ArrayLike | None = None,
-    beyond: str = "raise",
 ) -> RequiredRatedPower:
     """Return the rated power needed for a noise reduction if the power is spent in the best way.
 
@@ -70,8 +69,6 @@ def required_rated_power(
     proportions : array_like, shape (J,), optional
         Proportions of the rated powers, such as ``[1, 1, 4]`` for a third loudspeaker with four times the power of the
         others; by default all are equal.
-    beyond : {"raise", "inf"}, default "raise"
-        Whether noise reductions that these taps do not attain with any power raise an error or need infinite power.
 
     Returns
     -------
@@ -81,7 +78,7 @@ def required_rated_power(
     Raises
     ------
     TypeError, ValueError
-        If a noise reduction is negative or out of reach, if signals do not fit the paths, are silent or not finite, or
+        If a noise reduction is negative, if signals do not fit the paths, are silent or not finite, or
         if another argument is out of range.
 
     Notes
@@ -106,7 +103,6 @@ def required_rated_power(
     >>> print(f"{bound.whole.noise_reduction_db:.2f} dB, scaled {bound.scaled.noise_reduction_db:.2f} dB")
     10.00 dB, scaled 5.99 dB
     """
-    as_choice(beyond, "beyond", ("raise", "inf"))
     wanted = as_finite_array(noise_reduction_db, "noise_reduction_db")
     if np.any(wanted < 0):
         raise ValueError(f"noise_reduction_db must not be negative, got {wanted.min():g} dB")
@@ -115,11 +111,6 @@ def required_rated_power(
     record = record_of(x, d, plant.secondary, n_taps).with_sound()
     shares = per_loudspeaker(1.0 if proportions is None else proportions, plant.n_loudspeakers, "proportions")
     search = _ScaleSearch(record.correlations(), shares, float(np.sum(np.mean(record.d**2, axis=-1))))
-    if beyond == "raise" and np.any(wanted > search.most_db + ROUNDING_DB):
-        raise ValueError(
-            f"noise_reduction_db must not exceed what unlimited power attains, {search.most_db:.2f} dB, got "
-            f"{wanted.max():g} dB; use longer control filters, or beyond='inf' to mark such values"
-        )
     found = np.array([search.powers(one) for one in wanted.ravel()])  # (n, 3, J)
     each = np.moveaxis(found, 1, 0).reshape(3, *wanted.shape, -1)
     return RequiredRatedPower(wanted, *(each[..., 0] if has_one_channel(plant, x) else each))

@@ -217,13 +217,10 @@ def coherence_bound(reference: ArrayLike, disturbance: ArrayLike, fs: float, *, 
         raise ValueError("reference and disturbance must not be silent: their coherence is undefined")
     between = csd(x[:, np.newaxis], d, fs, nperseg=segment)[1]  # (I, K, n_frequencies)
     floor, tiny = 1e-30, np.finfo(float).tiny
-    if len(x) == 1:
-        coherent = np.sum(np.abs(between[0]) ** 2, axis=0) / np.maximum(of_x[0], tiny)
-    else:
-        spectra = np.moveaxis(csd(x[:, np.newaxis], x, fs, nperseg=segment)[1], -1, 0)  # (n_frequencies, I, I)
-        cross = np.moveaxis(between, -1, 0)
-        explained = np.linalg.pinv(spectra, rcond=1e-10, hermitian=True) @ cross
-        coherent = np.einsum("fik,fik->f", cross.conj(), explained).real
+    spectra = np.moveaxis(csd(x[:, np.newaxis], x, fs, nperseg=segment)[1], -1, 0)  # (n_frequencies, I, I)
+    cross = np.moveaxis(between, -1, 0)
+    explained = np.linalg.pinv(spectra, rcond=1e-10, hermitian=True) @ cross
+    coherent = np.einsum("fik,fik->f", cross.conj(), explained).real
     remaining = np.clip(1 - coherent / np.maximum(of_d, tiny), floor, 1)
     overall = max(float(np.sum(remaining * of_d) / np.sum(of_d)), floor)
     return CoherenceBound(frequencies, -10 * np.log10(remaining), float(-10 * np.log10(overall)))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from copy import copy
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_real_array
 from ..core.block import LOUDEST_LEARNT
-from ..power.amplifiers import Amplifiers, LinearAmplifier, amplifier_of_each
+from ..power.amplifiers import Amplifiers, amplifier_of_each
 
 
 def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndarray:
@@ -27,23 +27,6 @@ def require_moderate(signal: np.ndarray, name: str, most: float = LOUDEST_LEARNT
     """Raise ValueError for samples from which a state could overflow."""
     if np.abs(signal).max() > most:
         raise ValueError(f"{name} must not be louder than {most:g}: scale the signals; nothing was changed")
-
-
-def amplifier_functions(amplifier: Amplifiers, n_loudspeakers: int) -> list[Any] | None:
-    """Return the functions of a sample that stand for the amplifiers, one for each loudspeaker; None without any."""
-    if amplifier is None:
-        return None
-    return [LinearAmplifier() if one is None else one for one in amplifier_of_each(amplifier, n_loudspeakers)]
-
-
-def amplified(amplifiers: list[Any] | None, y: np.ndarray) -> np.ndarray:
-    """Return what the amplifiers, as far as they are known, make of the control signals (J,).
-
-    A divergence stays one.
-    """
-    if amplifiers is None or not np.isfinite(y).all():
-        return y
-    return np.array([amplifier(value) for amplifier, value in zip(amplifiers, y.tolist(), strict=True)])
 
 
 def through(paths: np.ndarray, lines: np.ndarray) -> np.ndarray:
@@ -85,12 +68,16 @@ class PlayedSound(ChannelFilters):
 
     def __init__(self, paths: np.ndarray, amplifier: Amplifiers) -> None:
         super().__init__(paths)
-        self._amplifiers = amplifier_functions(amplifier, self.n_inputs)
+        self._amplifiers = None if amplifier is None else amplifier_of_each(amplifier, self.n_inputs)
 
     def play(self, control_signal: ArrayLike) -> np.ndarray:
         """Add a controller's newest control signal, and return it, (J,)."""
         y = np.asarray(control_signal, dtype=np.float64).reshape(-1)
         if y.size != self.n_inputs:
             raise ValueError(f"controller must return {self.n_inputs} control signals, got {y.size}")
-        self.push(amplified(self._amplifiers, y))
+        played = y
+        if self._amplifiers is not None and np.isfinite(y).all():  # a divergence stays one
+            each = zip(self._amplifiers, y.tolist(), strict=True)
+            played = np.array([value if amplifier is None else amplifier(value) for amplifier, value in each])
+        self.push(played)
         return y

@@ -318,14 +318,10 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         with self.in_use:
             self._estimated_path()[:] = after
             if self._uncertainty is None or not self.takes_guard:
-                self._filter_again()
+                self._block.refilter()
             else:  # measured paths, for example, have another distance from the new path
                 self.secondary_path_uncertainty = self._uncertainty
             self._after_new_path(before)
-
-    def _filter_again(self) -> None:
-        """Filter the stored references with the present estimate, and the results with the guard."""
-        self._block.refilter()
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Adapt what the algorithm knows to the new estimate; `before` is the last one, of the same shape."""
@@ -552,7 +548,9 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
             part = slice(begin, begin + LONGEST_CALL)
             done, answer = block.listen(x[part], e[part], adapting[part])
             if answer:
-                raise refused_while_listening(f"{REASONS[answer]}; nothing was changed", begin + done)
+                refused = ValueError(f"{REASONS[answer]}; nothing was changed")
+                refused.add_note(f"in sample {begin + done} of those listened to")
+                raise refused
 
     def looped(self) -> Looped | None:
         """Return what the core's loop needs to run this controller; None if Python must call the steps."""
@@ -583,10 +581,3 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 def _rows(room: np.ndarray, length: int) -> np.ndarray:
     """Return three rows of a length at the start of the room for three of the longest."""
     return room.reshape(-1)[: 3 * length].reshape(3, length)
-
-
-def refused_while_listening(reason: str, sample: int) -> ValueError:
-    """Return the error of a sample that was refused before the control was switched on."""
-    refused = ValueError(reason)
-    refused.add_note(f"in sample {sample} of those listened to")
-    return refused

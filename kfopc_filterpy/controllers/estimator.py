@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
-from numpy.typing import ArrayLike
 
 from ..filters.kfopc import KFOPC
 from ..plant import Secondary
@@ -145,23 +144,6 @@ class KalmanController(CoreController):
             raise
         if powers is self._own_constraint:
             powers.advance(d, h[0, 0], x)
-
-    def process(
-        self,
-        references: ArrayLike | None,
-        errors: ArrayLike,
-        *,
-        adapt: bool | ArrayLike = True,
-        out: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Process a block, see `BlockProcessing.process`.
-
-        To the estimator, a sample that is not adapted to is missed.
-        """
-        y = super().process(references, errors, adapt=adapt, out=out)
-        if not np.ravel(adapt)[-1]:
-            self.estimator.update(None)
-        return y
 
     def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> None:
         if self.constraint is self._own_constraint:

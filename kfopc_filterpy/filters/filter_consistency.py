@@ -193,7 +193,7 @@ def consistency(
 
 
 def _saved(runs: Any) -> tuple[np.ndarray, ...]:
-    """Return innovations, 0 where they are missing, which are there, S, x and P of several Savers."""
+    """Return innovations, which are zero where they are missing, which are there, S, x and P of several Savers."""
     if not all(hasattr(run, name) for run in runs for name in ("z", "y", "S", "x", "P")):
         raise TypeError("saver must be a filterpy.common.Saver that has saved each update, or a list of them")
     lengths = {len(run.z) for run in runs}
@@ -205,7 +205,7 @@ def _saved(runs: Any) -> tuple[np.ndarray, ...]:
     y, x = (array.reshape(*array.shape[:2], -1) for array in (y, x))
     # filterpy saves None for a missed sample, and a `KFOPC` NaN for a missing component.
     there = np.broadcast_to(~np.isnan(z).reshape(*z.shape[:2], -1), y.shape)
-    return np.where(there, y, 0.0), there, S, x, P
+    return y, there, S, x, P
 
 
 def _errors(x: np.ndarray, truth: Any) -> np.ndarray:

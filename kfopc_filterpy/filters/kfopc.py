@@ -567,11 +567,8 @@ class KFOPC(KalmanFilter, Checkpointed):
         Fs: Sequence[Any] | np.ndarray | None = None,
         Qs: Sequence[Any] | np.ndarray | None = None,
         inv: Callable[[np.ndarray], np.ndarray] = np.linalg.inv,
-        *,
-        us: Sequence[Any] | np.ndarray | None = None,
-        Bs: Sequence[Any] | np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Run filterpy's `rts_smoother`, with the control inputs that it leaves out.
+        """Run filterpy's `rts_smoother`; what it leaves out is refused.
 
         Parameters
         ----------
@@ -581,8 +578,6 @@ class KFOPC(KalmanFilter, Checkpointed):
             Those that `batch_filter` got.
         inv : callable, optional
             As in filterpy.
-        us, Bs : sequence, optional
-            Control inputs that `batch_filter` got, and their matrices; by default ``kf.B``.
 
         Returns
         -------
@@ -592,17 +587,17 @@ class KFOPC(KalmanFilter, Checkpointed):
         Raises
         ------
         ValueError
-            NaN or Inf, wrong shapes, a fading memory (``alpha``), or no `us` although control inputs moved this filter.
+            NaN or Inf, wrong shapes, a fading memory (``alpha``), or a filter that control inputs have moved.
 
         Examples
         --------
         >>> import numpy as np
         >>> from kfopc_filterpy import KFOPC
         >>> kf = KFOPC(dim_x=1)
-        >>> kf.H, kf.B, us = [[1.0]], np.array([[1.0]]), [0.0, 5.0, 5.0]
-        >>> means, covariances, _, _ = kf.batch_filter([0.0, 5.0, 10.0], us=us)
-        >>> print(kf.rts_smoother(means, covariances, us=us)[0].ravel())
-        [ 0.  5. 10.]
+        >>> kf.H = [[1.0]]
+        >>> means, covariances, _, _ = kf.batch_filter([0.0, 5.0, 10.0])
+        >>> print(kf.rts_smoother(means, covariances)[0].ravel().round(2))
+        [1.9  4.76 7.38]
         """
         n, size = len(Xs), self.dim_x  # type: ignore[arg-type]
         x, P = as_finite_array(Xs, "Xs"), as_finite_array(Ps, "Ps")
@@ -610,32 +605,15 @@ class KFOPC(KalmanFilter, Checkpointed):
             raise ValueError(f"Xs must be (n, {size}[, 1]) and Ps (n, {size}, {size}), got {x.shape} and {P.shape}")
         if self.alpha != 1.0:
             raise ValueError(f"alpha must be 1, got {self.alpha:g}: filterpy's smoother leaves the fading memory out")
-        without_B = Bs is None and self.B is None
-        if self._moved and (us is None or (without_B and any(u is not None and np.any(u) for u in us))):
+        if self._moved:
             raise ValueError(
-                f"{'us=' if us is None else 'Bs='} is missing: control inputs moved this filter, and filterpy's smoother "
-                "leaves them out. Pass us= and Bs= as to batch_filter, or us=[0] * n if none moved it in these samples"
+                "control inputs moved this filter, and filterpy's smoother leaves them out: make what drives the state a "
+                "part of it, or smooth the samples of a filter that had no inputs"
             )
         for name, given in (("Fs", Fs), ("Qs", Qs)):
             if given is not None:
                 checked_steps.require_matrix(given, (n, size, size), name)
-        smoothed, P, K, Pp = super().rts_smoother(x, P, Fs, Qs, inv)
-        if us is not None:  # the means again, with the inputs
-            F, B = ([own] * n if given is None else given for given, own in ((Fs, self.F), (Bs, self.B)))
-            if not len(us) == len(B) == n:
-                raise ValueError(f"us and Bs must have {n} values, one for each of Xs, got {len(us)} and {len(B)}")
-            smoothed = x.copy()
-            for k in range(n - 1, 0, -1):
-                checked_steps.require_control(self, us[k], B[k])
-                moved: Any = 0.0 if us[k] is None or B[k] is None else np.dot(B[k], us[k])
-                if np.ndim(moved) > 0:
-                    if np.size(moved) != size:
-                        raise ValueError(
-                            f"us and Bs must move {size} states, but those of step {k} move {np.size(moved)}"
-                        )
-                    moved = np.reshape(moved, x[k].shape)
-                smoothed[k - 1] += np.dot(K[k - 1], smoothed[k] - np.dot(F[k], x[k - 1]) - moved)
-        return smoothed, P, K, Pp
+        return super().rts_smoother(x, P, Fs, Qs, inv)
 
     def get_prediction(
         self,

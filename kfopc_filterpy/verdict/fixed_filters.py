@@ -105,7 +105,6 @@ class FixedFilters:
             n_taps=self.n_taps,
             disturbance=self.d,
             proportions=rated_power if self.several else None,
-            beyond="inf",
         ).rated_power
         return found if self.several else float(found)
 

@@ -94,7 +94,7 @@ def step(controller: Any, x: Any, e: Any, adapts: bool = True) -> Any:
     return y
 
 
-@pytest.mark.parametrize("name", [name for name in ALL if name not in PYTHONS])
+@pytest.mark.parametrize("name", ALL)
 def test_blocks_are_the_steps_bit_for_bit(name: str) -> None:
     """However a recording is cut into blocks, and whichever samples are not adapted to."""
     blocks, steps = ALL[name](), ALL[name]()

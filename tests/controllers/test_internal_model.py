@@ -9,7 +9,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from helpers.controllers import KALMAN, MANY, PATHS, SEVERAL, VARIANTS, K, constraint, made
-from helpers.loop import AMPLIFIERS, FS, MU, N_TAPS, S_HAT, N, S, noises, run
+from helpers.loop import AMPLIFIERS, FS, MU, N_TAPS, S_HAT, N, S, noises
 from scipy.signal import lfilter
 
 from kfopc_filterpy import KFOPC, KalmanController, Plant, fx_lms, kf_anc, kf_opc, kf_pb, simulate
@@ -201,12 +201,3 @@ def test_a_refused_error_leaves_the_state_and_one_that_never_comes_counts_as_sil
 def test_what_is_refused(call: Any, message: str) -> None:
     with pytest.raises((ValueError, TypeError), match=message):
         call(with_internal_model(fx_lms(4, S_HAT, step_size=MU)))
-
-
-def test_the_given_controller_stays_as_it_was() -> None:
-    controller = fx_lms(N_TAPS, S_HAT, step_size=MU)
-    before = content_of(controller)
-    made_from_it = with_internal_model(controller)
-    assert content_of(controller) == before
-    assert (made_from_it.name, made_from_it.n_references, controller.n_references) == ("feedback FxLMS", 0, 1)
-    assert run(controller).algorithm == "FxLMS"

@@ -8,41 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 from helpers.channels import random_paths
 from helpers.controllers import ALL, I, J, K
 from helpers.loop import S_HAT
 from helpers.simulation import X
 
-from kfopc_filterpy import KFOPC, KalmanController, frequency_domain_fx_lms, fx_lms
+from kfopc_filterpy import frequency_domain_fx_lms, fx_lms
 from kfopc_filterpy.controllers import CoreController
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: KalmanFilter(4, 1),
-        lambda: KFOPC(4),
-        lambda: KFOPC.random_walk(4, state_noise=1.0, measurement_noise=1.0),
-    ],
-)
-def test_a_sample_without_adaptation_is_missed_by_the_estimator(make: Any) -> None:
-    """As after filterpy's `update(None)`, the likelihood is that of a zero residual."""
-    controller, adapting = (KalmanController(make(), [0.0, 1.0]) for _ in range(2))
-    for one in (controller, adapting):
-        one.process(X[:10], 0.5 * X[:10])
-    before = np.copy(controller.estimator.x)
-    controller.process(X[10:12], X[10:12], adapt=np.array([True, False]))
-    adapting.process(X[10:12], X[10:12], adapt=np.array([False, True]))
-    assert adapting.estimator.y.item() != 0.0
-    estimator = controller.estimator
-    assert estimator.z.tolist() == [[None]]
-    assert estimator.log_likelihood == pytest.approx(-0.5 * np.log(2 * np.pi * estimator.S.item()), rel=1e-14)
-    assert not np.array_equal(estimator.x, before)  # the sample before was adapted to
-    x, P = np.copy(estimator.x), np.copy(estimator.P)
-    controller.process(X[12:14], X[12:14], adapt=False)
-    np.testing.assert_array_equal(estimator.x, x)
-    np.testing.assert_array_equal(estimator.P, P)
 
 
 def test_a_subclass_with_its_own_step_is_called_for_each_sample() -> None:

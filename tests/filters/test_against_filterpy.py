@@ -359,19 +359,14 @@ class RandomWalk(Twins):
 
 
 class Rated(Twins):
-    """Filters with a rated power, of whose estimates a user assigns some."""
-
-    powers: Constraint | None = None
-    supplied: dict[str, float]
-    unconstrained_factor = 1.0
+    """Filters with a rated power: filterpy's filter gets the measurement scaled by their factor, which is the oracle's."""
 
     @initialize(n=st.integers(1, 5), x_ndim=st.integers(1, 2), seed=seeds)
     def start(self, n: int, x_ndim: int, seed: int) -> None:
         self.begin_rated(KFOPC(n, 1, 1, constraint=OutputPowerConstraint(0.5, fs=FS, memory_s=MEMORY_S)), x_ndim, seed)
 
     def begin_rated(self, ours: KFOPC, x_ndim: int, seed: int) -> None:
-        self.rng = np.random.default_rng(seed)
-        self.powers, self.supplied = Constraint(0.5, fs=FS, memory_s=MEMORY_S), {}
+        self.rng, self.powers = np.random.default_rng(seed), Constraint(0.5, fs=FS, memory_s=MEMORY_S)
         self.begin(ours, ours.dim_x, 1, 1, x_ndim, seed)
         for _ in range(2):  # an H that never changes is refused
             self.measure("update", self.z(self.rng), H=self.row(self.rng))
@@ -379,86 +374,39 @@ class Rated(Twins):
     def model(self, rng: np.random.Generator) -> dict[str, Any]:
         return super().model(rng) | {"F": np.eye(self.oracle.dim_x)}
 
-    def reference(self, may_lack: bool = False) -> dict[str, Any]:
-        """Return an argument of `update`: a reference, or none if it is not needed."""
-        if may_lack and (self.powers is None or self.supplied.keys() & {"constraint_factor", "secondary_path_gain"}):
-            return {}
+    def reference(self) -> dict[str, Any]:
         return {"reference": self.rng.normal()}
 
-    def measure(self, method: str, z: Any, *before: Any, given: dict[str, Any] | None = None, **arguments: Any) -> None:
+    def measure(self, method: str, z: Any, *before: Any, given: float | None = None, **arguments: Any) -> None:
         if z is None:
             super().measure(method, z, *before, **arguments)
             return
-        given = self.reference(may_lack=self.rng.random() < 0.3) if given is None else given
+        x = self.rng.normal() if given is None else given
         own = copy.deepcopy(z)
-        getattr(self.ours, method)(*before, own, **copy.deepcopy(arguments), **given)
+        getattr(self.ours, method)(*before, own, **copy.deepcopy(arguments), reference=x)
         if isinstance(own, np.ndarray):
             own[...] = 7.0  # the filter has a copy
-        if self.powers is None:
-            assert self.ours.constraint_factor == self.unconstrained_factor
-        else:
-            newest = np.ravel(arguments.get("H", arguments.get("H_i", self.oracle.H)))[0]
-            self.take_powers(np.ravel(z).astype(float).item() ** 2, newest**2, given.get("reference"))
-            np.testing.assert_allclose(np.array(self.readings(), float), self.expected_readings(), rtol=1e-10)
-        self.read = self.readings()
+        newest = np.ravel(arguments.get("H", arguments.get("H_i", self.oracle.H)))[0]
+        factor = self.powers.take(np.ravel(z).astype(float).item() ** 2, newest**2, x**2)
+        for name, expected in {
+            "constraint_factor": factor,
+            "disturbance_power": self.powers.disturbance_power,
+            "secondary_path_gain": self.powers.gain,
+        }.items():
+            assert getattr(self.ours, name) == pytest.approx(expected, rel=1e-10), name
         getattr(self.oracle, method)(*before, self.asked(self.oracle, z), **copy.deepcopy(arguments))
         self.oracle.z = np.asarray(z, float).reshape(np.shape(self.oracle.z))
-
-    def take_powers(self, d_squared: float, filtered_squared: float, x: float | None) -> None:
-        assert self.powers is not None
-        if x is None:
-            self.powers.disturbance_power = self.powers.d2.take(d_squared)
-        else:
-            self.powers.take(d_squared, filtered_squared, x**2)
-
-    def expected_readings(self) -> tuple[float, float, float]:
-        """Return the factor, the power and the gain of eq. 10-13, with what a user supplied in their places."""
-        powers, supplied = self.powers, self.supplied
-        assert powers is not None
-        power = supplied.get("disturbance_power", powers.disturbance_power)
-        gain = supplied.get("secondary_path_gain", powers.gain)
-        factor = min(1.0, np.sqrt(powers.rated_power * gain / power)) if power else 1.0
-        return supplied.get("constraint_factor", factor), power, gain
 
     def asked(self, kf: Any, z: Any) -> Any:
         factor = self.ours.constraint_factor
         return z if kf is self.ours or factor == 1.0 else np.float64(factor) * np.asarray(z)  # a float32, too
 
-    def readings(self) -> list[Any]:
-        return [getattr(self.ours, name) for name in ("constraint_factor", "disturbance_power", "secondary_path_gain")]
-
     def predict(self, seed: int, form: str) -> None:
         super().predict(seed, "Q" if form == "F" else form)
 
-    def look(self) -> None:
-        super().look()
-        if hasattr(self, "read"):  # nothing but a measurement changes them
-            assert repr(self.readings()) == repr(self.read)
-
-    @rule(
-        name=st.sampled_from(["rated_power", "constraint_factor", "disturbance_power", "secondary_path_gain"]),
-        value=st.floats(0.1, 4.0) | st.none(),
-    )
-    def assign_a_power(self, name: str, value: float | None) -> None:
-        if name == "rated_power":
-            self.ours.rated_power = value
-            if value is None:
-                self.powers = None
-            elif self.powers is None:
-                self.powers, self.supplied = Constraint(value, fs=FS, memory_s=MEMORY_S), {}
-            else:
-                self.powers.rated_power = value
-            assert self.ours.rated_power == value
-        elif self.powers is not None:
-            setattr(self.ours, name, value)
-            self.supplied = {key: own for key, own in self.supplied.items() if key != name}
-            self.supplied |= {} if value is None else {name: value}
-        elif name == "constraint_factor":
-            self.ours.constraint_factor, self.unconstrained_factor = value, 1.0 if value is None else value
-        else:
-            with pytest.raises(ValueError, match=rf"{name} needs a constraint: set rated_power first"):
-                setattr(self.ours, name, value)
-        self.read = self.readings()
+    @rule(rated_power=st.floats(0.1, 4.0))
+    def assign_a_rated_power(self, rated_power: float) -> None:
+        self.ours.rated_power = self.powers.rated_power = rated_power
 
     @rule(seed=seeds)
     def mask(self, seed: int) -> None:
@@ -469,14 +417,13 @@ class Rated(Twins):
     def batch_and_smooth(self, seed: int, update_first: bool) -> None:
         """A batch is its steps."""
         rng, batch = np.random.default_rng(seed), copy.deepcopy(self.ours)
-        zs = [self.z(rng), None, self.z(rng)]
-        Hs, given = [self.row(rng) for _ in zs], [self.reference() for _ in zs]
-        references = [one["reference"] for one in given]
+        zs, references = [self.z(rng), None, self.z(rng)], rng.normal(size=3).tolist()
+        Hs = [self.row(rng) for _ in zs]
         means, covariances, _, _ = batch.batch_filter(zs, Hs=Hs, references=references, update_first=update_first)
         for k, z in enumerate(zs):
             for updates in (update_first, not update_first):
                 if updates:
-                    self.measure("update", z, H=Hs[k], given=given[k])
+                    self.measure("update", z, H=Hs[k], given=references[k])
                     np.testing.assert_array_equal(means[k], self.ours.x)
                     np.testing.assert_array_equal(covariances[k], self.ours.P)
                 else:

@@ -140,16 +140,6 @@ def test_an_observation_that_changes_with_time_is_used():
     assert abs(fit_noise(kf, z).log_likelihood - fit.log_likelihood) > 1
 
 
-def test_the_scale_of_the_parts_does_not_matter():
-    kf = constant_velocity()
-    z = drawn(kf, 0.3, 2.0, 150, seed=5)
-    expected = fit_noise(kf, z)
-    kf.Q, kf.R = 1e-5 * kf.Q, 1e4 * kf.R
-    fit = fit_noise(kf, z)
-    assert_allclose(fit.Q, expected.Q, rtol=1e-5)
-    assert_allclose(fit.R, expected.R, rtol=1e-5)
-
-
 def test_a_noise_that_the_record_does_not_show_is_zero():
     fit = fit_noise(local_level(), 2.0 * np.random.default_rng(0).standard_normal(500))
     assert fit.state_noise[0] == 0

@@ -6,7 +6,6 @@ That it does what filterpy does, step for step, is tested in `test_against_filte
 from __future__ import annotations
 
 import copy
-from typing import Any
 
 import mpmath
 import numpy as np
@@ -14,7 +13,7 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from helpers.rows import rows_of
 
-from kfopc_filterpy import KFOPC, KalmanController, kf_anc, kf_opc
+from kfopc_filterpy import KFOPC
 from kfopc_filterpy.signals import band_limited_noise
 
 
@@ -43,28 +42,6 @@ def test_thousands_of_steps_as_filterpy(n: int, kind: str, P0: float, alpha: flo
     for name in ("x", "P", "P_prior", "K"):
         theirs, ours = (getattr(kf, name) for kf in filters)
         assert np.abs(theirs - ours).max() <= 1e-10 * np.abs(theirs).max(), name
-
-
-@pytest.mark.parametrize("limited", [False, True])
-def test_the_core_computes_the_same_in_a_controller(limited: bool) -> None:
-    """To 1e-9: the core stores P as one triangle, and sums in another order."""
-    S, noises, rng = [0.0, 1.0, -0.4], {"state_noise": 1e-6, "measurement_noise": 0.01}, np.random.default_rng(2)
-    rated: Any = {"rated_power": 0.5, "fs": 16000} if limited else {}
-    numpys = KalmanController(KFOPC.random_walk(24, **noises, **rated), S)
-    cores = kf_opc(24, S, **noises, **rated) if limited else kf_anc(24, S, **noises)
-    x = np.convolve(rng.normal(size=3000), np.hanning(7))
-    d, played = 2.0 * np.roll(x, 5) - 0.7 * np.roll(x, 9), np.zeros((2, 3))  # newest control signal first
-    for n in range(2000):
-        played[:, 1:] = played[:, :-1]
-        for i, controller in enumerate((numpys, cores)):
-            played[i, 0] = controller.control_signal(x[n])
-            controller.update(d[n] - played[i] @ S)
-        assert played[0, 0] == pytest.approx(played[1, 0], rel=1e-9, abs=1e-9)
-    np.testing.assert_allclose(cores.weights, numpys.weights, rtol=0, atol=1e-9)
-    P = numpys.estimator.P
-    np.testing.assert_allclose(cores.covariance, P, rtol=0, atol=1e-9 * P.max())
-    assert cores.constraint_factor == pytest.approx(numpys.constraint_factor, rel=1e-9)
-    assert (cores.constraint_factor < 0.9) == limited
 
 
 # A large initial variance

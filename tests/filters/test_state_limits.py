@@ -101,27 +101,6 @@ def test_equalities_have_the_closed_form_and_projection_its_covariance():
     assert_allclose(constrained(kf, equalities=(D, d)), kf.x, atol=1e-12)  # a P that is singular, and already there
 
 
-def test_inequalities_and_a_power_leave_the_covariance_as_it_is():
-    kf = made(3, 5)
-    P = kf.P.copy()
-    x = constrained(kf, upper=-1.0, power=(np.eye(3), 100.0), project=True)
-    assert np.array_equal(kf.x, x) and np.array_equal(kf.P, P)  # noqa: PT018
-    kf.x[0] = 7.0
-    assert x[0, 0] <= -1.0  # what was returned is an array of its own
-
-
-def test_a_filter_goes_on_after_a_projection_and_on_the_random_walk():
-    kf = KFOPC.random_walk(3, state_noise=0.1, measurement_noise=0.1)
-    kf.predict()
-    kf.update(5.0, H=np.array([1.0, 0.5, 0.2]))
-    constrained(kf, equalities=([1.0, 1.0, 1.0], 1.0), upper=0.9, project=True)
-    assert_allclose(kf.x.sum(), 1.0)
-    assert kf.x.max() <= 0.9 + 1e-9
-    kf.predict()
-    kf.update(1.0, H=np.array([0.0, 1.0, 0.0]))
-    assert np.all(np.isfinite(kf.P))
-
-
 def test_without_a_limit_that_acts_the_estimate_is_returned():
     kf = made(4, 2)
     assert_allclose(constrained(kf), kf.x, rtol=0, atol=0)

@@ -51,20 +51,6 @@ def test_a_users_controller_gets_arrays_and_the_signals_are_convolutions() -> No
     assert "2 loudspeaker(s), 3 microphone(s)" in repr(result)
 
 
-def test_a_divergence_ends_the_run_with_nan() -> None:
-    class Growing(Fixed):
-        rated_power = np.array([1.0, 2.0])
-
-        def control_signal(self, reference: np.ndarray) -> np.ndarray:
-            return np.array([10.0 ** len(self.errors), 0.0])
-
-    result = run(Growing())
-    assert result.diverged_at_s == 7 / FS
-    assert np.isfinite(result.error[:, :7]).all()
-    assert np.isnan(result.error[:, 7:]).all()
-    assert np.isnan(result.control_signal[:, 7:]).all()
-
-
 @pytest.mark.parametrize(
     ("controller", "match"),
     [

@@ -207,11 +207,3 @@ def test_a_users_controller_that_returns_no_number_has_diverged(bad):
     result = simulate(Broken(), X, PLANT, disturbance=D)
     assert result.diverged_at_s == 5 / FS
     np.testing.assert_array_equal(np.isnan(result.error), np.arange(X.size) >= 5)
-
-
-def test_divergence_at_the_first_sample():
-    made = KalmanController(RandomWalkKFOPC(6, state_noise=1e-6, measurement_noise=0.01), S)
-    made.estimator.x[0] = 1e9
-    result = simulate(made, X, PLANT, disturbance=D, record_weights_every=50)
-    assert result.diverged_at_s == 0.0
-    assert np.all(np.isnan(result.weights))

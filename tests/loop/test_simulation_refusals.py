@@ -5,15 +5,13 @@ import copy
 import numpy as np
 import pytest
 from helpers.comparing import assert_goes_on_as, assert_same_run
-from helpers.simulation import FS, MAKERS, PLANT, D, Integrator, S, Stepwise, X, constraint
+from helpers.simulation import FS, MAKERS, PLANT, D, Integrator, S, Stepwise, X
 
 from kfopc_filterpy import KFOPC, KalmanController, Plant, fx_lms, simulate
 from kfopc_filterpy.controllers.kalman import KalmanInCore, kalman_settings
-from kfopc_filterpy.paths import fir_path
 from kfopc_filterpy.signals import Recording
 
 PLANT_AND_PRIMARY = Plant(S, [1.0], fs=FS)
-SLOW = Plant(S, fs=8000)
 REFUSED = [
     ({"reference": X[:, None]}, ValueError, "reference must have its channels first"),
     (
@@ -88,19 +86,6 @@ def test_errors_of_a_users_controller_pass_with_the_sample_named():
     with pytest.raises(KeyError, match="mine") as caught:
         simulate(Failing(), X, PLANT, disturbance=D)
     assert caught.value.__notes__ == ["in sample 0 of the run"]
-
-
-@pytest.mark.parametrize("name", MAKERS)
-def test_refuses_a_controller_made_for_another_sample_rate(name):
-    make = MAKERS[name]
-    with pytest.raises(ValueError, match="fs is 8000 Hz but the controller's secondary path is for 16000 Hz"):
-        simulate(make(fir_path(S, 16000.0)), X, SLOW, disturbance=D)
-    if name in ("KF-ANC", "FxLMS"):  # they know no seconds
-        simulate(make(), X, SLOW, disturbance=D)
-        return
-    with pytest.raises(ValueError, match="fs is 8000 Hz but the controller's power memory is for 16000 Hz"):
-        simulate(make(), X, SLOW, disturbance=D)
-    simulate(make(constraint=constraint(fs=8000)), X, SLOW, disturbance=D)
 
 
 # ---- Silence, and updates without a solution

@@ -11,6 +11,7 @@ import pickle
 
 import numpy as np
 import pytest
+from oracles.powers import Constraint as Oracle
 
 from kfopc_filterpy import OutputPowerConstraint
 
@@ -23,17 +24,6 @@ def constraint(samples: float, window: str = "exponential", **kwargs: float) -> 
     return OutputPowerConstraint(kwargs.pop("rated_power", 1.0), fs=FS, memory_s=samples / FS, window=window, **kwargs)
 
 
-def direct_power(x: np.ndarray, n: int, samples: float, window: str) -> float:
-    """Mean square after sample n, from the definition."""
-    if window == "sliding":
-        return float(np.mean(x[max(n + 1 - round(samples), 0) : n + 1] ** 2))
-    forgetting, mean = math.exp(-1.0 / samples), 0.0
-    for k in range(n + 1):
-        gain = max(1.0 - forgetting, 1.0 / (k + 1))
-        mean = (1.0 - gain) * mean + gain * float(x[k]) ** 2
-    return mean
-
-
 def signals(n: int, seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Disturbance, filtered reference, reference."""
     rng = np.random.default_rng(seed)
@@ -44,14 +34,12 @@ def signals(n: int, seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("samples", [1, 7, 50])
 def test_powers_gain_and_factor_follow_eq_10_to_13(window: str, samples: int) -> None:
     ours = constraint(samples, window, rated_power=0.8)
-    d, xf, x = signals(160)
-    for n in range(d.size):
-        factor = ours.advance(d[n], xf[n], x[n])
-        power, filtered, reference = (direct_power(s, n, samples, window) for s in (d, xf, x))
-        assert ours.disturbance_power == pytest.approx(power, rel=CLOSE)
-        assert ours.secondary_path_gain == pytest.approx(filtered / reference, rel=CLOSE)
-        assert factor == pytest.approx(min(math.sqrt(0.8 * filtered / reference / power), 1.0), rel=CLOSE)
-        assert ours.factor == factor
+    oracle = Oracle(0.8, fs=FS, memory_s=samples / FS, window=window)
+    for d, xf, x in zip(*signals(160), strict=True):
+        assert ours.advance(d, xf, x) == pytest.approx(oracle.take(d**2, xf**2, x**2), rel=CLOSE)
+        assert ours.disturbance_power == pytest.approx(oracle.disturbance_power, rel=CLOSE)
+        assert ours.secondary_path_gain == pytest.approx(oracle.gain, rel=CLOSE)
+        assert ours.factor == pytest.approx(oracle.alpha, rel=CLOSE)
 
 
 def test_the_sliding_window_keeps_no_rounding() -> None:
@@ -66,7 +54,7 @@ def test_the_sliding_window_keeps_no_rounding() -> None:
     for n in range(x.size):
         ours.advance(x[n])
         if n >= switch:
-            assert ours.disturbance_power == pytest.approx(direct_power(x, n, samples, "sliding"), rel=CLOSE)
+            assert ours.disturbance_power == pytest.approx(np.mean(x[n + 1 - samples : n + 1] ** 2), rel=CLOSE)
 
 
 @pytest.mark.parametrize("window", ["exponential", "sliding"])

@@ -95,19 +95,3 @@ def test_what_is_no_rating_or_differs_in_volts_is_refused():
     ):
         with pytest.raises((TypeError, ValueError), match=message):
             output_limits(ratings)
-
-
-def test_a_loudspeakers_peak_volts_and_watts_are_in_units_of_the_control_signal():
-    rating = LoudspeakerRating(8.0, noise_watt=2.0, peak_volts=12.0, volts_per_unit=4.0)
-    assert rating.amplitude_limit == pytest.approx(12.0 / 4.0)
-    assert rating.watt(1.0) == pytest.approx(4.0**2 / 8.0)
-    assert rating.watt(rating.rated_power) == pytest.approx(2.0)
-    peak_alone = LoudspeakerRating(8.0, peak_volts=12.0, volts_per_unit=4.0)
-    assert peak_alone.rated_power == pytest.approx(72.0 / 4.0**2)  # of a sine
-
-
-def test_limits_are_ratings_themselves():
-    limits = OutputLimits(1.5, 3.0, 0.25, "fuse")
-    assert output_limits(limits) == limits
-    both = output_limits([limits, AmplifierRating(ohm=8.0, sine_watt=1.0)])
-    assert (both.rated_power, both.amplitude_limit, both.decided_by) == (1.5, 3.0, "fuse")
