@@ -38,19 +38,6 @@ class KalmanInCore(CoreController):
         self._take_setting("measurement_noise", value)
 
     @property
-    def innovation(self) -> NumberOrArray:
-        """Innovation alpha d^ - w'x' of the last update; with several channels that of each microphone, (K,).
-
-        The microphones are measured one after the other, each with the weights that those before it have corrected.
-        """
-        return self._number_of_each("innovation")
-
-    @property
-    def innovation_variance(self) -> NumberOrArray:
-        """Predicted variance S of that innovation (eq. 7), 0 before the first sample; with several channels (K,)."""
-        return self._number_of_each("innovation_variance")
-
-    @property
     def covariance(self) -> np.ndarray:
         """State covariance P, (J I L, J I L), in the order of ``weights.ravel()``; a new array."""
         fields = {name: self._block.fields[name].ravel() for name in ("owed", "triangle", "gain_direction")}

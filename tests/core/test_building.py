@@ -237,7 +237,7 @@ def test_headers_stand_alone(header: str, suffix: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", sorted(building.FOLDER.glob("libanc-*")), ids=lambda path: path.name)
 def test_every_public_symbol_begins_with_anc(path: Path) -> None:
-    listing = ran(tool("nm", "binutils"), "-D", "--defined-only", path)
+    listing = ran(tool("nm"), "-D", "--defined-only", path)
     kinds = {name: kind for kind, name in (line.split()[-2:] for line in listing.splitlines())}
     assert [name for name in kinds if not name.startswith("anc_")] == []
     data = {name for name, kind in kinds.items() if kind in "DRBV"} - {"anc_stamp"}
@@ -250,7 +250,7 @@ def test_every_public_symbol_begins_with_anc(path: Path) -> None:
 @pytest.mark.parametrize("path", sorted(building.FOLDER.glob("libanc-*")), ids=lambda path: path.name)
 def test_a_library_needs_no_memory_and_no_files(path: Path) -> None:
     """No allocation, no input or output: of the C library it takes copying, sqrt and the like."""
-    listing = ran(tool("nm", "binutils"), "-D", "--undefined-only", path)
+    listing = ran(tool("nm"), "-D", "--undefined-only", path)
     names = {line.split()[-1].split("@")[0] for line in listing.splitlines()}
     allowed = {"memcpy", "memset", "memmove", "sqrt", "sqrtf", "__stack_chk_fail"}
     assert {name for name in names if not name.startswith(("_ITM_", "__cxa_finalize", "__gmon_start__"))} <= allowed

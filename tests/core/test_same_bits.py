@@ -77,7 +77,7 @@ def test_other_ways_to_compile(real: str, other: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("level", building.levels())
 @pytest.mark.parametrize("compiler", ["gcc", "clang", "zig"])
 def test_other_compilers(real: str, level: str, compiler: str, tmp_path: Path) -> None:
-    command = zig() if compiler == "zig" else [tool(compiler, compiler)]
+    command = zig() if compiler == "zig" else [tool(compiler)]
     if building.LEVELS.index(level) > building.LEVELS.index(highest_level()):
         pytest.skip(f"this processor has no {level}")
     assert_same(ran(program("same_bits", tmp_path, command, real=real, level=level)), real, tmp_path)
@@ -88,7 +88,7 @@ def test_other_compilers(real: str, level: str, compiler: str, tmp_path: Path) -
 @pytest.mark.parametrize("processor", ["aarch64", "riscv64", "arm", "x86"])
 def test_other_processors(real: str, processor: str, tmp_path: Path) -> None:
     """A static program of zig, run by an emulator."""
-    emulator = tool({"x86": "qemu-i386"}.get(processor, f"qemu-{processor}"), "qemu-user")
+    emulator = tool({"x86": "qemu-i386"}.get(processor, f"qemu-{processor}"))
     target = {"arm": "arm-linux-musleabihf"}.get(processor, f"{processor}-linux-musl")
     made = program("same_bits", tmp_path, zig(), "-static", real=real, target=target)
     assert_same(ran(emulator, made), real, tmp_path)
@@ -98,7 +98,7 @@ def test_other_processors(real: str, processor: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("real", building.REALS)
 def test_windows(real: str, tmp_path: Path) -> None:
     """A program for Windows, run by Wine."""
-    wine = tool("wine", "wine")
+    wine = tool("wine")
     made = program("same_bits", tmp_path, zig(), real=real, target="x86_64-windows-gnu")
     windows_name = made.with_suffix(".exe")
     made.rename(windows_name)

@@ -48,7 +48,7 @@ def test_libraries_of_a_wheel(tag: str, tmp_path: Path) -> None:
     assert set(found) == expected
     for path in found.values():
         content = path.read_bytes()
-        assert re.search(kind, ran(tool("file", "file"), path))
+        assert re.search(kind, ran(tool("file"), path))
         assert building.stamp().encode() in content
         assert b".building-" not in content  # no path of the machine that made it
         if tag.endswith("arm64"):
@@ -59,7 +59,7 @@ def runner(tag: str, folder: Path) -> tuple[str, Callable[[Path, Path], str]]:
     """Return the target of a program that loads a library of a wheel, and what runs it here; or skip the test."""
     target = WHEELS[tag][0]
     if tag == "win_amd64":
-        wine = tool("wine", "wine")
+        wine = tool("wine")
         return target, lambda made, library: ran(
             wine, made, library, WINEDEBUG="-all", WINEPREFIX=str(folder / "prefix")
         )

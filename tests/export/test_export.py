@@ -14,7 +14,7 @@ import pytest
 from helpers.c99 import FAST, WARNINGS, Program
 from helpers.channels import random_paths, through
 from helpers.controllers import ALL, KALMAN, PATHS, SEVERAL, I, K, limiters
-from helpers.core import c_compiler, compiler
+from helpers.core import c_compiler, tool
 from helpers.core import ran as succeeds
 from helpers.loop import FS, MU, S_HAT, S
 
@@ -159,7 +159,7 @@ def test_a_feedback_controller_has_no_reference_argument(several, dtype, tmp_pat
 )
 def test_the_bits_are_those_of_python_in_a_million_samples(name, command, dtype, tmp_path):
     controller, n = CONTROLLERS[name](), 10**6
-    program = Program(controller, tmp_path, dtype, ("-O3",), command=compiler(command))
+    program = Program(controller, tmp_path, dtype, ("-O3",), command=tool(command))
     result = ran(controller, slice(None), n, dtype)
     out = program.run(result.reference, result.error)
     np.testing.assert_array_equal(out.y, np.atleast_2d(result.control_signal))
@@ -327,7 +327,7 @@ def test_complex_h_may_come_first_and_the_source_refuses_to_be_cpp(tmp_path):
     path = export_c(ALL["KF-OPC plain"](), tmp_path / "anc.c").path
     succeeds(*c_compiler(), "-std=c99", *WARNINGS, "-include", "complex.h", "-fsyntax-only", path)
     succeeds(*c_compiler(), "-std=c99", *WARNINGS, "-include", "complex.h", "-fsyntax-only", path.with_suffix(".h"))
-    done = subprocess.run([compiler("c++", "g++"), "-x", "c++", "-fsyntax-only", path], capture_output=True, text=True)
+    done = subprocess.run([tool("c++", "g++"), "-x", "c++", "-fsyntax-only", path], capture_output=True, text=True)
     assert done.returncode != 0
     assert "compile this file as C99; C++ can include its header" in done.stderr
 
@@ -345,7 +345,7 @@ def test_the_example_in_a_folder_runs(name, dtype, command, tmp_path):
     assert exported.path == folder / "left.c"
     stated = re.search(r"`cc (-std=c99 .*) main.c left.c -lm -o main", (folder / "README.md").read_text())
     flags = (*stated[1].replace("-O3", "-O0").split(), *WARNINGS)
-    succeeds(compiler(command), *flags, folder / "main.c", exported.path, "-lm", "-o", folder / "main")
+    succeeds(tool(command), *flags, folder / "main.c", exported.path, "-lm", "-o", folder / "main")
     done = subprocess.run([str(folder / "main")], capture_output=True, text=True)
     assert done.returncode == 0
     assert re.fullmatch(r"100 samples, largest y \S+, 0 updates refused\n", done.stdout)
@@ -379,7 +379,7 @@ def test_two_controllers_of_other_names_link_into_one_program_also_of_cpp(tmp_pa
     for path in objects:
         succeeds(*c_compiler(), "-std=c99", *FAST, *WARNINGS, "-c", path.with_suffix(".c"), "-o", path)
     options = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-I", tmp_path)
-    succeeds(compiler("c++", "g++"), *options, main, *objects, "-lm", "-o", tmp_path / "main")
+    succeeds(tool("c++", "g++"), *options, main, *objects, "-lm", "-o", tmp_path / "main")
     succeeds(tmp_path / "main")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers.c99 import WARNINGS
 from helpers.channels import random_paths
-from helpers.core import compiler, ran, tool, zig
+from helpers.core import ran, tool, zig
 
 from kfopc_filterpy import OutputLimiter, OutputPowerConstraint, Plant, fx_lms, kf_opc, kf_pb, simulate
 from kfopc_filterpy.export import Float32Controller, export_fmu
@@ -191,7 +191,7 @@ def test_the_sources_compile_as_their_description_says(command, opened):
     described = ElementTree.parse(f"{sources}/buildDescription.xml").find(".//SourceFileSet")
     files = [f"{sources}/{one.get('name')}" for one in described]
     flags = [*described.get("compilerOptions").replace("-O3", "-O0").split(), *WARNINGS, "-fPIC", "-shared"]
-    ran(compiler(command), *flags, *files, "-lm", "-o", f"{unit.folder}/binaries/x86_64-linux/anc.so")
+    ran(tool(command), *flags, *files, "-lm", "-o", f"{unit.folder}/binaries/x86_64-linux/anc.so")
     unit.slave.freeInstance()
     unit.slave = unit.opened()
     expected = run(Float32Controller(CONTROLLERS["KF-PB"]()), True, 300)
@@ -207,7 +207,7 @@ def test_the_same_controller_gives_the_same_file(tmp_path):
 
 def test_the_library_for_windows_has_the_bits_of_python(opened, tmp_path):
     """A small host loads it, in wine. The error is an input of the next step."""
-    wine, unit = tool("wine", "wine"), opened()
+    wine, unit = tool("wine"), opened()
     host, sources = Path(__file__).with_name("windows_host.c"), f"{unit.folder}/sources"
     ran(*zig(), "-target", "x86_64-windows-gnu", "-I", sources, host, "-o", tmp_path / "host.exe")
     result = run(CONTROLLERS["KF-OPC"]())

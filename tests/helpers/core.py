@@ -58,17 +58,17 @@ def known() -> list[str]:
     return list(ALGORITHMS)
 
 
-def compiler(*names: str) -> str:
-    """Return the first of these compilers that the machine has, or skip the test."""
+def tool(*names: str) -> str:
+    """Return the path of the first of these programs that the machine has, or skip the test."""
     found = next((path for name in names if (path := shutil.which(name))), None)
     if found is None:
-        pytest.skip(f"needs a compiler: none of {', '.join(names)} is installed")
+        pytest.skip(f"needs {' or '.join(names)}")
     return found
 
 
 def c_compiler() -> list[str]:
     """Return the machine's C compiler, or skip the test."""
-    return [compiler("cc", "gcc", "clang")]
+    return [tool("cc", "gcc", "clang")]
 
 
 def zig() -> list[str]:
@@ -81,14 +81,6 @@ def zig() -> list[str]:
 def highest_level() -> str:
     """Return the highest level of this processor, whether a library was built for it or not."""
     return {3: "x86-64-v3", 4: "x86-64-v4"}.get(library.load().free.anc_processor_level(), "baseline")
-
-
-def tool(name: str, package: str) -> str:
-    """Return the path of a program of the machine, or skip the test."""
-    found = shutil.which(name)
-    if found is None:
-        pytest.skip(f"needs {name}, which comes with {package}")
-    return found
 
 
 def ran(*command: object, cwd: Path | None = None, **variables: str) -> str:

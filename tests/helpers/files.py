@@ -32,12 +32,8 @@ def _npz(path: Path) -> None:
     np.savez_compressed(path, noise=signal(), fs=FS, other=np.array([1.0]))
 
 
-def _mat5(path: Path) -> None:
-    scipy.io.savemat(path, {"noise": signal()[:, None], "fs": float(FS), "text": "a fan"}, do_compression=True)
-
-
-def _mat5_plain(path: Path) -> None:
-    scipy.io.savemat(path, {"noise": signal()[:, None], "fs": float(FS), "text": "a fan"})
+def _mat5(path: Path, compressed: bool = True) -> None:
+    scipy.io.savemat(path, {"noise": signal()[:, None], "fs": float(FS), "text": "a fan"}, do_compression=compressed)
 
 
 def _mat4(path: Path) -> None:
@@ -103,7 +99,7 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "x.npy": _npy,
     "x.npz": _npz,
     "packed.mat": _mat5,
-    "plain.mat": _mat5_plain,
+    "plain.mat": lambda path: _mat5(path, compressed=False),
     "four.mat": _mat4,
     "new.mat": _mat73,
     "struct.mat": _mat_struct,

@@ -73,15 +73,6 @@ def test_the_loudest_stretch_of_the_last_silence_counts() -> None:
     np.testing.assert_allclose(np.asarray(loudness.before), [1.0, 1.0])
 
 
-def test_powers_do_not_depend_on_the_blocks() -> None:
-    x, e = np.random.default_rng(0).standard_normal((2, 3, 60))
-    loudness = Loudness(20, 3, RATIO)
-    for first in range(0, 60, 4):
-        loudness.hear(x[:2, first : first + 4], e[:, first : first + 4])
-    expected = [np.sum(np.mean(s.reshape(len(s), 3, 20) ** 2, axis=2), axis=0) for s in (x[:2], e)]
-    np.testing.assert_allclose(loudness.windows, np.transpose(expected))
-
-
 # ---- The supervisor
 
 FS, BLOCK = 8000.0, 40
