@@ -18,7 +18,7 @@ from .._validate import as_count, as_nonnegative, as_positive, per_loudspeaker
 from ..bounds.power_constrained import power_constrained_wiener
 from ..bounds.prediction import predictor_reference
 from ..bounds.settings import SuggestedSettings, suggest_settings
-from ..controllers.base import Controller, listed
+from ..controllers.base import Controller
 from ..paths.identification import PathEstimate, estimate_path
 from ..plant import Plant
 from .faults import LARGEST
@@ -104,18 +104,10 @@ class RunReport(RunStatus):
 
     stopped_by: str
     round_trip_samples: int | None
-    secondary: PathEstimate | None
+    secondary: PathEstimate | None = field(repr=False)
     possible_db: float
     blocks: int
     controller: Any = field(repr=False)
-
-    def __repr__(self) -> str:
-        rated = "" if self.rated_power is None else f" (rated {listed(self.rated_power, 'g')})"
-        return (
-            f"<RunReport: {self.seconds:.4g} s, stopped by {self.stopped_by}, noise reduction "
-            f"{listed(self.reduction_db, '.1f')} dB, output power {listed(self.powers, '.3g')}{rated}, "
-            f"{self.overruns} overruns in {self.blocks} blocks, {self.health!r}>"
-        )
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.studies import plain_run, run_study, short_duct, smaller
+from helpers.studies import plain_run, row_of, run_study, short_duct, smaller
 
 from comparisons.bench import make_controller
 from comparisons.studies import amplifier, cases
@@ -34,11 +34,7 @@ def small() -> Any:
 @pytest.mark.parametrize(("algorithm", "known"), [("KF-PB", UNKNOWN), ("KF-ANC", KNOWN), ("clipping FxLMS", UNKNOWN)])
 def test_a_row_is_that_of_a_plain_run(small: Any, algorithm: str, known: str) -> None:
     report, scene = small
-    (row,) = (
-        r
-        for r in report.extra["rows"]
-        if (r["noise"], r["overdrive_db"], r["known"], r["algorithm"]) == ("tone", 10.0, known, algorithm)
-    )
+    row = row_of(report, noise="tone", overdrive_db=10.0, known=known, algorithm=algorithm)
     driven = saturating(scene, Case("duct", "tone", "hard clip"), 10.0, known)
     clip = HardClipAmplifier(np.sqrt(2 * 0.1))  # 10 dB below the unconstrained power of 1
     amplifiers = {"amplifier": clip, "known": clip if known == KNOWN else None}

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.studies import plain_run, run_study, short_duct, smaller
+from helpers.studies import plain_run, row_of, run_study, short_duct, smaller
 
 from comparisons.studies import cases, mismatch
 from comparisons.studies.cases import Case
@@ -30,14 +30,11 @@ def small() -> Any:
         return run_study(mismatch), case_scene(Case("duct", "tone"), short["duct"])
 
 
-def _is(row: dict[str, Any], noise: str, kind: str, amount: float, tuned_with: str) -> bool:
-    return (row["noise"], row["kind"], row["amount"], row["tuned_with"]) == (noise, kind, amount, tuned_with)
-
-
 @pytest.mark.parametrize("algorithm", ["KF-OPC", "FxLMS"])
 def test_rows_are_those_of_plain_runs(small: Any, algorithm: str) -> None:
     report, scene = small
-    (row,) = (r for r in report.extra["rows"] if r["algorithm"] == algorithm and _is(r, "tone", "phase", 45.0, EXACT))
+    place = {"noise": "tone", "kind": "phase", "amount": 45.0, "tuned_with": EXACT}
+    row = row_of(report, algorithm=algorithm, **place)
     estimate = path_taps(perturbed_path(scene.secondary, fs=16000.0, phase_deg=45.0))
     wrong = replace(scene, secondary_estimate=estimate)
     result = plain_run(wrong, algorithm, row["setting"])

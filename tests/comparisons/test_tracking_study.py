@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.studies import plain_run, run_study, short_duct, smaller
+from helpers.studies import plain_run, row_of, run_study, short_duct, smaller
 
 from comparisons.studies import cases, tracking
 from comparisons.studies import tracking_events as events
@@ -35,7 +35,7 @@ def small() -> Any:
 @pytest.mark.parametrize("algorithm", ["KF-PB", "FxLMS"])
 def test_a_row_is_that_of_plain_runs(small: Any, algorithm: str) -> None:
     report, scenes = small
-    (row,) = (r for r in report.extra["rows"] if (r["event"], r["algorithm"]) == ("sign", algorithm))
+    row = row_of(report, event="sign", algorithm=algorithm)
     results = [plain_run(scene, algorithm, row["setting"]) for scene in scenes]
     e, d, y = (np.array([getattr(r, name) for r in results]) for name in ("error", "disturbance", "control_signal"))
     rated = scenes[0].rated_power

@@ -50,6 +50,12 @@ def run_study(study: Any) -> StudyReport:
     return report
 
 
+def row_of(report: StudyReport, **values: Any) -> dict[str, Any]:
+    """Return the one row of a report that has these values."""
+    (row,) = (row for row in report.extra["rows"] if values.items() <= row.items())
+    return row
+
+
 def plain_run(
     scene: Scene, algorithm: str, setting: Any, *, amplifier: Any = None, known: Any = None, **options: Any
 ) -> SimulationResult:
