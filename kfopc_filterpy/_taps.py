@@ -212,7 +212,7 @@ def primary_paths(
 
     Taps (K, n_taps) are those of one reference.
     """
-    if not is_system(paths) and not _has_systems(paths) and np.ndim(paths) == 2:
+    if not is_system(paths) and not _has_entries(paths) and np.ndim(paths) == 2:
         rate = sampling_rate(paths, fs, name=name) if tells_rate(paths) else None
         return path_matrix(as_real_array(paths, name)[:, np.newaxis], fs=fs, name=name, axes=PRIMARY_AXES)[0], rate
     return path_matrix(paths, fs=fs, n_taps=n_taps, name=name, axes=PRIMARY_AXES)
@@ -240,9 +240,9 @@ def path_matrix(
         if (paths.noutputs, paths.ninputs) == (1, 1):
             return _taps_of(paths, fs, n_taps, name).reshape(1, 1, -1), sampling_rate(paths, fs, name=name)
         rows = [[paths[k, j] for j in range(paths.ninputs)] for k in range(paths.noutputs)]
-        return _from_systems(rows, fs, n_taps, name, axes)
-    if _has_systems(paths):
-        return _from_systems(paths, fs, n_taps, name, axes)
+        return _from_entries(rows, fs, n_taps, name, axes)
+    if _has_entries(paths):
+        return _from_entries(paths, fs, n_taps, name, axes)
     taps = as_real_array(paths, name)
     if taps.ndim == 1:
         taps = taps.reshape(1, 1, -1)
@@ -254,9 +254,11 @@ def path_matrix(
     return np.ascontiguousarray(taps), sampling_rate(paths, fs, name=name) if tells_rate(paths) else None
 
 
-def _has_systems(paths: Any) -> bool:
+def _has_entries(paths: Any) -> bool:
+    """Return whether paths are rows of systems, recordings or arrays, which may differ in length."""
     rows = paths if isinstance(paths, list | tuple) else ()
-    return any(tells_rate(entry) for row in rows if isinstance(row, list | tuple) for entry in row)
+    entries = [entry for row in rows if isinstance(row, list | tuple) for entry in row]
+    return any(tells_rate(entry) or (isinstance(entry, np.ndarray) and entry.ndim == 1) for entry in entries)
 
 
 def sampled_path_matrix(paths: PathModels, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float]:
@@ -270,7 +272,7 @@ def _taps_of(path: Any, fs: float | None, n_taps: int | None, name: str) -> np.n
     return path_taps(path, fs=fs, n_taps=None if finite_taps(path, name) is not None else n_taps, name=name)
 
 
-def _from_systems(
+def _from_entries(
     rows: Any, fs: float | None, n_taps: int | None, name: str, axes: str
 ) -> tuple[np.ndarray, float | None]:
     if len({len(row) for row in rows}) != 1:

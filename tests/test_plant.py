@@ -263,3 +263,12 @@ def test_a_plant_is_an_estimate_of_its_own_secondary_path():
     assert rate == FS
     with pytest.raises(ValueError, match=r"needs a plant that does not change: .* plant\.at\(time_s\)"):
         estimated_secondary(plant.changed_at(1.0, secondary=-S))
+
+
+def test_responses_of_a_room_may_differ_in_length():
+    """As pyroomacoustics gives them: a list for each microphone, of an array for each source."""
+    rir = [[np.eye(100, dtype=np.float32)[40]], [0.5 * np.eye(141, dtype=np.float32)[52]]]
+    plant = Plant(rir, primary=rir, fs=16000)
+    for taps in (plant.secondary, plant.primary):
+        assert taps.shape == (2, 1, 141)
+        assert np.argwhere(taps).tolist() == [[0, 0, 40], [1, 0, 52]]

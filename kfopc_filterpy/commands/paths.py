@@ -86,7 +86,7 @@ def _judge_residual(
 
     Warn if it explains little.
     """
-    from ..paths.timing import timing_fault
+    from ..paths.timing import delay_of, timing_fault
     from ..signals.quality import clipping_remarks
 
     if residual_db <= POOR_DB:
@@ -96,6 +96,12 @@ def _judge_residual(
     if fault := timing_fault(sent, heard, fs, (options.excitation, options.response)):
         raise ValueError(f"{options.excitation} {explained}: {fault} Nothing was written")
     if share < max(UNRELATED, CHANCE * options.taps / sent.size):
+        delay = delay_of(sent, heard)
+        if delay >= options.taps:
+            raise ValueError(
+                f"{options.response} comes {1e3 * delay / fs:.3g} ms after {options.excitation}, but --taps {options.taps} last "
+                f"{1e3 * options.taps / fs:.3g} ms: give --taps {delay + options.taps}, or a shorter latency; nothing was written"
+            )
         raise ValueError(
             f"{options.excitation} {explained}, hardly more than chance would: are the files swapped, or of different "
             "recordings? Give what was sent to the amplifier first, then what the microphone heard at the same time; "

@@ -8,6 +8,7 @@ _SEGMENT_S, _LEAST_SEGMENTS, _MOST_SEGMENTS = 1.0, 8, 64
 _LEAST_DELAY, _LEAST_JUMP = 0.5, 8  # samples by which the delay must change over a record, or at once
 _LARGEST_DRIFT = 1e-3  # of clocks; quartzes differ by less, so more is a jump between the halves
 _LEAST_GAIN = 0.8  # of the power left unexplained, once the delay is put right: what does less is not the cause
+_LEAST_PEAK = 100  # times the mean square of a response; of a million samples of noise, the highest has 28 times
 _LEAST_LEAD = 0.5  # of a response's energy that comes before time 0: the files are swapped
 _SPECTRUM = 4096  # samples of a spectrum's segments at most
 _FLOOR = 1e-3  # of the mean power, added to a spectrum that is divided by
@@ -124,3 +125,10 @@ def _lead(sent: np.ndarray, heard: np.ndarray) -> int:
     early = response[segment:] ** 2
     lead = segment - int(np.argmax(early))
     return lead if np.sum(early) > _LEAST_LEAD * np.sum(response**2) and lead > 1 else 0
+
+
+def delay_of(sent: np.ndarray, heard: np.ndarray) -> int:
+    """Return the delay in samples at which a recording is most like the one that should cause it; 0 if there is none."""
+    response = _responses(sent[np.newaxis], heard[np.newaxis])[0] ** 2
+    delay = int(np.argmax(response[: sent.size]))
+    return delay if response[delay] > _LEAST_PEAK * np.mean(response) else 0

@@ -39,7 +39,11 @@ class Content(NamedTuple):
 
 
 def require_file(path: str | os.PathLike[str]) -> None:
-    """Raise OSError if there is no such file or it may not be read, ValueError if it is empty."""
+    """Raise OSError if there is no such file or it may not be read, ValueError if it is empty, TypeError if it is no path."""
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(
+            f"path must be the path of a file, got {type(path).__name__}: write it to a file, or pass Recording(samples, fs)"
+        )
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path} does not exist or is not a file; the current folder is {Path.cwd()}")
     with open(path, "rb") as file:

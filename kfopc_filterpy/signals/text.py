@@ -252,7 +252,8 @@ def without_time(path: str | os.PathLike[str], table: Table) -> Content:
         if len(times) >= NO_SIGNAL:
             raise ValueError(
                 f"{path} has a first column that rises in uneven steps, from {steps.min():g} to {steps.max():g}: export it "
-                "with a constant sampling rate and all digits of the times, or without the times"
+                "with a constant sampling rate and all digits of the times, or without the times; of a frequency response or a "
+                "microphone's calibration file, export the impulse response"
             )
         return Content(columns * factors, None, unit)
     units = [found[1] for found in map(_TIME_UNIT.match, reversed(header)) if found]

@@ -39,6 +39,17 @@ def test_files_that_a_path_does_not_explain_are_refused_and_nothing_is_written(c
     assert not (tmp_path / "S.wav").exists()
 
 
+def test_a_latency_that_is_longer_than_the_fit_is_named(command, folder, tmp_path):
+    sent = np.random.default_rng(1).standard_normal(2 * FS)
+    write_wav(folder / "sent.wav", sent, FS)
+    write_wav(folder / "late.wav", np.convolve(np.eye(1000)[920], sent)[: sent.size], FS)
+    fit = ("paths", "identify", "sent.wav", "late.wav", "-o", tmp_path / "S.wav", "--taps")
+    code, _, err = command(*fit, 512)
+    assert code == 2
+    assert "late.wav comes 115 ms after sent.wav, but --taps 512 last 64 ms: give --taps 1432, or" in err
+    assert command(*fit, 1432)[0] == 0
+
+
 def test_a_fit_that_leaves_much_unexplained_is_warned_of(command, folder, tmp_path):
     sent = np.random.default_rng(1).standard_normal(2 * FS)
     write_wav(folder / "sent.wav", sent, FS)

@@ -84,6 +84,16 @@ def test_a_comma_that_may_be_either_is_refused(tmp_path, text):
         read_recording(tmp_path / "x.csv", fs=8)
 
 
+def test_a_calibration_file_and_an_open_file_are_no_recordings(tmp_path):
+    (tmp_path / "x.txt").write_text("*1000Hz -38.6\n" + "".join(f"{20 * 1.02**n:.2f} 0.1\n" for n in range(300)))
+    with pytest.raises(
+        ValueError, match=r"x\.txt .* of a frequency response or a microphone's calibration file, export"
+    ):
+        read_recording(tmp_path / "x.txt", fs=FS)
+    with open(tmp_path / "x.txt", "rb") as file, pytest.raises(TypeError, match="path of a file, got BufferedReader: "):
+        read_recording(file)
+
+
 def test_an_empty_field_is_named(tmp_path):
     (tmp_path / "x.csv").write_text("t,a,p\n0.0,,0.5\n0.1,,0.5\n")
     with pytest.raises(ValueError, match=r"x\.csv is text that is no numbers.*; line 2 has an empty field"):
