@@ -211,16 +211,15 @@ def coherence_bound(reference: ArrayLike, disturbance: ArrayLike, fs: float, *, 
     for each, name in zip((x, d), named, strict=True):
         for channel in each:
             as_signal(channel, name, min_length=8 * segment, length=x.shape[1])
-    frequencies, of_x = welch(x, fs, nperseg=segment)
-    of_d = welch(d, fs, nperseg=segment)[1].sum(axis=0)
-    if not np.any(of_x) or not np.any(of_d):
-        raise ValueError("reference and disturbance must not be silent: their coherence is undefined")
-    between = csd(x[:, np.newaxis], d, fs, nperseg=segment)[1]  # (I, K, n_frequencies)
-    floor, tiny = 1e-30, np.finfo(float).tiny
+    frequencies, of_d = welch(d, fs, nperseg=segment)
+    of_d = of_d.sum(axis=0)
     spectra = np.moveaxis(csd(x[:, np.newaxis], x, fs, nperseg=segment)[1], -1, 0)  # (n_frequencies, I, I)
-    cross = np.moveaxis(between, -1, 0)
+    if not np.any(spectra) or not np.any(of_d):
+        raise ValueError("reference and disturbance must not be silent: their coherence is undefined")
+    cross = np.moveaxis(csd(x[:, np.newaxis], d, fs, nperseg=segment)[1], -1, 0)  # (n_frequencies, I, K)
     explained = np.linalg.pinv(spectra, rcond=1e-10, hermitian=True) @ cross
     coherent = np.einsum("fik,fik->f", cross.conj(), explained).real
+    floor, tiny = 1e-30, np.finfo(float).tiny
     remaining = np.clip(1 - coherent / np.maximum(of_d, tiny), floor, 1)
     overall = max(float(np.sum(remaining * of_d) / np.sum(of_d)), floor)
     return CoherenceBound(frequencies, -10 * np.log10(remaining), float(-10 * np.log10(overall)))

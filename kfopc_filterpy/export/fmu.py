@@ -19,7 +19,7 @@ from .._validate import as_positive, how_to_install
 from .._writing import replacing
 from ..core.building import build
 from .c99 import checked_name, exported_as
-from .source import FLAGS_OF_AN_EXPORT, Exported
+from .source import Exported
 
 if TYPE_CHECKING:
     from ..controllers.core_controller import CoreController
@@ -91,7 +91,7 @@ def export_fmu(
     token = hashlib.sha256("".join((*sources.values(), repr(fs))).encode()).hexdigest()[:32]
     sources |= {"fmi3.c": _glue(exported, fs, token, headers["fmi3FunctionTypes.h"])} | headers
     files: dict[str, str | bytes] = {f"sources/{file}": text for file, text in sources.items()}
-    files["sources/buildDescription.xml"] = _build_description(name)
+    files["sources/buildDescription.xml"] = exported.filled("build_description.xml")
     files["modelDescription.xml"] = _model_description(exported, fs, token)
     with tempfile.TemporaryDirectory() as folder:
         for file, text in sources.items():
@@ -129,22 +129,9 @@ def _glue(exported: Exported, fs: float, token: str, declarations: str) -> str:
     return text + "\n".join(refusals)
 
 
-def _build_description(name: str) -> str:
-    return f"""<?xml version="1.0" encoding="UTF-8"?>
-<fmiBuildDescription fmiVersion="3.0">
-  <BuildConfiguration modelIdentifier="{name}">
-    <SourceFileSet language="C99" compilerOptions="{FLAGS_OF_AN_EXPORT}">
-      <SourceFile name="{name}.c"/>
-      <SourceFile name="fmi3.c"/>
-    </SourceFileSet>
-  </BuildConfiguration>
-</fmiBuildDescription>
-"""
-
-
 def _model_description(exported: Exported, fs: float, token: str) -> str:
     version = import_module(str(__package__).partition(".")[0]).__version__
-    name, number, step, shape = exported.name, NUMBERS[exported.real], repr(1.0 / fs), exported.block.shape
+    number, shape = NUMBERS[exported.real], exported.block.shape
     time = f'<{number} name="time" valueReference="0" causality="independent" variability="continuous"/>'
     signals = {"reference": exported.n_references, "error": shape.microphones, "control_signal": shape.loudspeakers}
     names = [f"{what}[{i + 1}]" if exported.multichannel else what for what, n in signals.items() for i in range(n)]
@@ -161,22 +148,12 @@ def _model_description(exported: Exported, fs: float, token: str) -> str:
         for unknown in ("Output", "InitialUnknown")
         for vr, _, _ in outputs
     ]
-    lines = "\n    "
-    return f"""<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="3.0" modelName="{name}" instantiationToken="{token}"
-    description={quoteattr(exported.description)} generationTool="kfopc_filterpy {version}"
-    variableNamingConvention="structured">
-  <CoSimulation modelIdentifier="{name}" canGetAndSetFMUState="true" canSerializeFMUState="true"
-      fixedInternalStepSize="{step}"/>
-  <LogCategories>
-    <Category name="logStatusError"/>
-  </LogCategories>
-  <DefaultExperiment startTime="0" stepSize="{step}"/>
-  <ModelVariables>
-    {lines.join(variables)}
-  </ModelVariables>
-  <ModelStructure>
-    {lines.join(structure)}
-  </ModelStructure>
-</fmiModelDescription>
-"""
+    return exported.filled(
+        "model_description.xml",
+        token=token,
+        quoted=quoteattr(exported.description),
+        version=version,
+        step=repr(1.0 / fs),
+        variables="\n    ".join(variables),
+        structure="\n    ".join(structure),
+    )

@@ -48,7 +48,7 @@ def scene_for(controller: Any, n: int = 300) -> tuple[Any, Plant, dict[str, Any]
         secondary, feedback, amplifier = S, FEEDBACK, AMPLIFIERS["soft"][0]
     plant = Plant(
         secondary, feedback=feedback if fed_back else None, amplifier=amplifier, fs=FS, sensor_noise_std=0.02
-    ).changed_at(63 / FS, secondary=0.9 * secondary)
+    ).changed_at(66 / FS, secondary=0.9 * secondary)  # within a block
     if not hasattr(controller, "listen"):
         del options["switch_on_s"]
     return (x if heard else None), plant, options | {"disturbance": d}
