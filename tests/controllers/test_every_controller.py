@@ -14,8 +14,8 @@ import pytest
 from helpers.channels import random_paths
 from helpers.checkpoints import Room
 from helpers.comparing import assert_same_run
-from helpers.controllers import ALL, IN_BLOCKS, PATHS, I, J, K, made
-from helpers.loop import AMPLIFIERS, FEEDBACK, FS, N_TAPS, S, noises, run
+from helpers.controllers import ALL, IN_BLOCKS, PATHS, I, J, K
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, S, noises
 from helpers.simulation import Stepwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -258,13 +258,3 @@ def test_a_refused_update_names_its_sample_and_the_rest_can_go_on(name: str) -> 
     if getattr(steps, "internal_model", False):
         return  # an error that never comes counts as silence, one that is left out does not
     np.testing.assert_array_equal(rest, steps.process(x, e, adapt=np.arange(200) != 120)[..., 121:])
-
-
-@pytest.mark.parametrize("name", ["KF-OPC", "KF-PB", "FxLMS"])
-def test_repr_names_the_algorithm_and_its_settings(name: str) -> None:
-    controller, limited = made(name, "plain"), made(name, "limiter")
-    run(controller, n=50)
-    rated = "" if controller.rated_power is None else ", rated power 0.3"
-    expected = f"<{controller.name}: {N_TAPS} taps{rated}, constraint factor {controller.constraint_factor:.3g}"
-    assert repr(controller) == f"{expected}>"
-    assert repr(limited).endswith(", limiter of rated power 0.05>")

@@ -115,7 +115,7 @@ class Own:
 
 
 class Proportional:
-    """A controller that does not adapt, with special methods of its own and a gain for tests."""
+    """A controller that does not adapt, with a gain for tests."""
 
     name, constraint_factor, gain = "proportional", 0.25, 10.0
 
@@ -130,12 +130,6 @@ class Proportional:
 
     def emitted(self, control_signal: float) -> None:
         self.played.append(control_signal)
-
-    def __deepcopy__(self, memo: Any) -> Proportional:
-        return Proportional()
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
 
 
 def test_a_users_controller_is_limited_as_the_built_in_is() -> None:

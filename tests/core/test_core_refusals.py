@@ -10,8 +10,10 @@ from helpers.core import ALGORITHMS, c_compiler, known, program, ran
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from kfopc_filterpy import OutputLimiter
 from kfopc_filterpy.core import building
 from kfopc_filterpy.core.block import Algorithm, Block, Shape
+from kfopc_filterpy.core.calls import limit
 
 ANY_NUMBER = st.one_of(
     st.sampled_from(
@@ -91,3 +93,18 @@ def test_under_sanitizers(name: str, real: str, plans: list[tuple[str, ...]], tm
     made = program(name, tmp_path, c_compiler(), *options, real=real)
     for arguments in plans:
         ran(made, *arguments, UBSAN_OPTIONS="print_stacktrace=1")
+
+
+def test_settings_are_in_the_order_of_the_c_file() -> None:
+    for name in known():
+        assert [one.name for one in Algorithm(name).settings] == list(ALGORITHMS[name])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_limiter_in_c_answers_nan_to_what_is_not_finite_and_keeps_its_state(bad: float) -> None:
+    limiter = OutputLimiter(0.1, fs=100.0, window_s=0.1)
+    limiter.process(np.linspace(-2.0, 2.0, 25))
+    before = [array.copy() for array in limiter.state]
+    assert np.isnan(limit(limiter.state.numbers.ctypes.data, limiter.state.laps.ctypes.data, bad))
+    for array, own in zip(limiter.state, before, strict=True):
+        np.testing.assert_array_equal(array, own)

@@ -151,21 +151,6 @@ def test_a_feedback_controller_has_no_reference_argument(several, dtype, tmp_pat
     succeeds(tmp_path / "main")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize(
-    ("name", "command"),
-    [("FxLMS limiter", "gcc"), ("kf_opc many", "clang"), ("kf_pb many", "gcc"), ("KF-PB plain", "clang")],
-)
-def test_the_bits_are_those_of_python_in_a_million_samples(name, command, dtype, tmp_path):
-    controller, n = CONTROLLERS[name](), 10**6
-    program = Program(controller, tmp_path, dtype, ("-O3",), command=tool(command))
-    result = ran(controller, slice(None), n, dtype)
-    out = program.run(result.reference, result.error)
-    np.testing.assert_array_equal(out.y, np.atleast_2d(result.control_signal))
-    assert not out.status.any()
-
-
 def test_in_a_long_run_of_float32_no_window_of_the_limiters_output_exceeds_the_rated_power(tmp_path):
     controller = CONTROLLERS["KF-OPC limiter"]()
     program = Program(controller, tmp_path, "float32", options=("-O1",))

@@ -30,7 +30,7 @@ TESTS = {
         "tests/filters/test_random_walk.py",
     ),
     "limiter.c": (
-        "tests/core/test_parts.py",
+        "tests/core/test_core_refusals.py",
         "tests/power/test_limiter.py",
         "tests/realtime/test_limiter_promise.py",
         BITS,
