@@ -169,7 +169,7 @@ def _facts(taps: np.ndarray, fs: float) -> dict[str, Any]:
         return facts | {"power_gain_db": None, "low_hz": None, "high_hz": None, "onset_s": None}
     band = achieved_band(taps, fs=fs)
     return facts | {
-        "power_gain_db": 10 * math.log10(max(secondary_path_gain(taps, band=(0.0, fs / 2), fs=fs), 1e-30)),
+        "power_gain_db": 10 * math.log10(max(secondary_path_gain(taps), 1e-30)),
         "low_hz": band.low_hz,
         "high_hz": band.high_hz,
         "onset_s": energy_onset(taps) / fs,

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from .._taps import finite_taps, path_taps, sampling_rate
 from .._types import PathModel
-from .._validate import as_band, as_signal
+from .._validate import as_signal
 from ..plant import Plant, as_constant_plant, has_one_channel
 from .file_checks import require_sound
 
@@ -75,26 +75,18 @@ def _radians(frequencies_hz: Any, fs: float) -> np.ndarray:
     return 2 * np.pi * f / fs
 
 
-def secondary_path_gain(
-    path: PathModel,
-    *,
-    band: tuple[float, float] | None = None,
-    reference: ArrayLike | None = None,
-    fs: float | None = None,
-) -> float:
+def secondary_path_gain(path: PathModel, *, reference: ArrayLike | None = None, fs: float | None = None) -> float:
     """Return the secondary-path gain ``G_s = E[x'^2] / E[x^2]`` (eq. 11), a power gain.
 
     Parameters
     ----------
     path : control.TransferFunction or array_like, shape (n_taps,)
         Secondary path with a finite impulse response.
-    band : (float, float), optional
-        Band in Hz of a white reference, by default 0 to fs/2; the gain is computed in closed form.
     reference : array_like, shape (n_samples,), optional
-        Reference signal to use instead of white noise; the first ``n_taps - 1`` samples, while the delay line fills, do
+        Reference signal, by default white noise; the first ``n_taps - 1`` samples, while the delay line fills, do
         not count.
     fs : float, optional
-        Sampling rate in Hz, needed for a tap array with a `band`.
+        Sampling rate in Hz that a system must have.
 
     Returns
     -------
@@ -104,7 +96,7 @@ def secondary_path_gain(
     Raises
     ------
     TypeError, ValueError
-        If both `band` and `reference` are given, or the reference is silent or too short.
+        If the reference is silent or too short.
 
     References
     ----------
@@ -115,25 +107,16 @@ def secondary_path_gain(
     >>> secondary_path_gain([0.0, 2.0])
     4.0
     """
-    from scipy.signal import correlate, lfilter
+    from scipy.signal import lfilter
 
     taps = path_taps(path, fs=fs)
     if reference is not None:
-        if band is not None:
-            raise ValueError("band and reference exclude each other: give one of them")
         x = as_signal(reference, "reference", min_length=taps.size)
         power = np.mean(x[taps.size - 1 :] ** 2)
         if power == 0:
             raise ValueError("reference must not be silent: the gain for it is undefined")
         return float(np.mean(lfilter(taps, 1.0, x)[taps.size - 1 :] ** 2) / power)
-    if band is None:
-        return float(taps @ taps)
-    fs = sampling_rate(path, fs)
-    low, high = as_band(band, fs)
-    # |S|² is the cosine series of the taps' autocorrelation; its mean over a band integrates term by term.
-    lags, autocorrelation = np.arange(taps.size), correlate(taps, taps)[taps.size - 1 :]
-    mean_cosine = (high * np.sinc(2 * lags * high / fs) - low * np.sinc(2 * lags * low / fs)) / (high - low)
-    return float(autocorrelation[0] + 2 * autocorrelation[1:] @ mean_cosine[1:])
+    return float(taps @ taps)
 
 
 @dataclass(frozen=True)

@@ -122,13 +122,7 @@ def band_limited_noise(
 
 
 def compressor_noise(
-    duration_s: float,
-    *,
-    fs: float,
-    rng: Seed,
-    power: float = 1.0,
-    shaft_hz: float = 24.5,
-    bandwidth_hz: float = 2000.0,
+    duration_s: float, *, fs: float, rng: Seed, power: float = 1.0, shaft_hz: float = 24.5, bandwidth_hz: float = 2000.0
 ) -> np.ndarray:
     """Make compressor-like noise: harmonics of a slowly wandering shaft speed, and broadband flow noise.
 

@@ -58,6 +58,7 @@ USUAL = ("KF-PB", "KF-OPC", "FxLMS")
 MOST_DIRECT_WEIGHTS = 256  # from which the Kalman filters of all weights together run only if they are named
 MEMORY_S, CHANNEL_MEMORY_S = 0.25, 1.0
 WEAK_DB = -20.0  # gain of the secondary path, over its mean in the noise's band, below which the loudspeaker is weak
+SWITCH_ON_S = 0.5  # into the record, but at most a tenth of it
 LEAST_RUN_S = 2.0  # its second half then has ten of an amplifier's windows of 0.1 s
 LEAST_TOLERANCE = 0.01  # of the least rated power
 SAME_DB, KEPT = 0.1, 1.02  # runs that differ by less are as good, and a rating that is exceeded by less is kept
@@ -81,7 +82,6 @@ def assess(
     memory_s: float | None = None,
     secondary_path_uncertainty: Uncertainty | None = DEFAULT_UNCERTAINTY,
     pascal_per_unit: ArrayLike | None = None,
-    switch_on_s: float | None = None,
     feedback: bool = False,
     bar: ProgressBar | None = None,
 ) -> Assessment:
@@ -128,8 +128,6 @@ def assess(
     pascal_per_unit : float or array_like, shape (K,), optional
         Sound pressure at the error microphone in Pa for a value of 1, of all microphones or of each. With it, sound
         levels are computed.
-    switch_on_s : float, optional
-        Time in s at which the control is switched on; by default 0.5 s, or a tenth of a shorter record.
     feedback : bool, default False
         Whether the controllers also predict the disturbance from its past (hybrid control, see `with_internal_model`).
         If there is neither a primary path nor a `disturbance`, there is no reference microphone, as in headphones, and
@@ -200,7 +198,7 @@ def assess(
     pascals = None if pascal_per_unit is None else _pascals(pascal_per_unit, K)
     if memory_s is None:
         memory_s = CHANNEL_MEMORY_S if several else MEMORY_S
-    start = _start_sample(switch_on_s, fs, x.shape[-1])
+    start = round(min(SWITCH_ON_S * fs, x.shape[-1] / 10))
     run_s = (x.shape[-1] - start) / fs
     if run_s < LEAST_RUN_S:
         raise ValueError(
@@ -222,7 +220,7 @@ def assess(
         margin_s = None if p is None else causality_margin(plant).margin_s
         late = max(0, round(-(margin_s or 0.0) * fs))
         bounds = FixedFilters(x[..., start:], d[..., start:], s, settings.n_taps, fs, late)
-        official = bounds.within(limits.rated_power)
+        within_power_db = bounds.within(limits.rated_power)
         required = bounds.needed(want_db, limits.rated_power)
     if any(issubclass(warning.category, np.exceptions.RankWarning) for warning in caught):
         notes.append("The reference is so narrow-band that larger weights could do better than the bound.")
@@ -257,7 +255,7 @@ def assess(
         else max(_coherence_db(bounds.x, bounds.d, fs), bounds.time_db),
         time_db=bounds.time_db,
         filter_db=bounds.filter_db,
-        power_db=bounds.limited(limits.rated_power)[1],
+        power_db=within_power_db,
     )
     cause = None if reached >= want_db else _cause(ceilings, want_db, late >= settings.n_taps)
     volts_per_unit, ohm = (scale_of(ratings, name, several) for name in ("volts_per_unit", "ohm"))
@@ -294,7 +292,6 @@ def assess(
         algorithm=algorithm,
         limits=limits,
         ceilings=ceilings,
-        bound_db=official,
         unlimited_power=bounds.free.control_power,
         required_rated_power=required,
         least_rated_power=least * limits.rated_power,
@@ -398,15 +395,6 @@ def _response_s(p: np.ndarray, s: np.ndarray, want_db: float, fs: float) -> floa
         for of_all, reached in zip(p, s, strict=True)
     ]
     return (max(lasting) + 1) / fs
-
-
-def _start_sample(switch_on_s: float | None, fs: float, n_samples: int) -> int:
-    """Return the sample at which the control is switched on; by default after 0.5 s, or a tenth of a shorter record."""
-    duration = n_samples / fs
-    time = min(0.5, 0.1 * duration) if switch_on_s is None else as_nonnegative(switch_on_s, "switch_on_s", unit="s")
-    if time >= duration:
-        raise ValueError(f"switch_on_s must be within the {duration:g} s of the noise, got {time:g} s")
-    return round(time * fs)
 
 
 def _reduction(run: SimulationResult) -> float:

@@ -134,8 +134,6 @@ class Assessment:
         What the rating allows the control signal; `each` has the limits of each loudspeaker.
     ceilings : Ceilings
         Noise reductions that nothing can surpass, one after the other.
-    bound_db : float
-        The least error that any fixed filter of this length reaches within the rated power, as a noise reduction.
     unlimited_power : float or ndarray, shape (J,)
         Power that this filter takes without a limit.
     required_rated_power : float or ndarray, shape (J,)
@@ -195,7 +193,6 @@ class Assessment:
     algorithm: str
     limits: Limits
     ceilings: Ceilings
-    bound_db: float
     unlimited_power: Any
     required_rated_power: Any
     least_rated_power: Any
@@ -218,6 +215,11 @@ class Assessment:
     loop: FeedbackMargin | None = None
     timing_fault: str | None = None
     origin: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def bound_db(self) -> float:
+        """The least error that any fixed filter of this length reaches within the rated power, as a noise reduction."""
+        return self.ceilings.power_db
 
     @property
     def verdict(self) -> str:

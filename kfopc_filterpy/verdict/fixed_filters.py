@@ -75,11 +75,6 @@ class FixedFilters:
         """Return the shortest look-ahead, of those tried, that reaches a noise reduction; None if none does."""
         return next((samples / self.fs for samples, reached in self.ahead.items() if reached >= want_db), None)
 
-    def limited(self, rated_power: NumberOrArray) -> tuple[np.ndarray, float]:
-        """Return the filter within the rated power, and its noise reduction in dB."""
-        weights, _ = constrained_weights(self.stretch, self.correlations, rated_power)
-        return weights, self.stretch.solution(weights).noise_reduction_db
-
     def within(self, rated_power: NumberOrArray) -> float:
         """Return the bound within the rated power, as a noise reduction in dB; warn if larger weights could do better.
 

@@ -26,6 +26,8 @@ def test_a_path_is_identified_from_a_recording(command, folder, tmp_path, suffix
     assert "24 taps" in out
     found = read_path(output, file_fs=FS if suffix == "npy" else None)
     assert found.fs == FS
+    if suffix in ("csv", "txt"):
+        assert np.loadtxt(output, delimiter="," if suffix == "csv" else "\t").shape == (24, 2)
     np.testing.assert_allclose(found.samples, taps, atol=1e-4)
 
 

@@ -17,7 +17,6 @@ import soundfile
 from helpers.commands import FS, ROOT, SCENE, process
 
 from kfopc_filterpy import Plant, verdict
-from kfopc_filterpy.bounds import predictor_reference, wiener_solution
 from kfopc_filterpy.commands import main
 from kfopc_filterpy.controllers.kf_pb import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance
@@ -297,12 +296,6 @@ def test_without_a_reference_microphone_the_noise_is_that_of_the_ear(command, fo
     page = (tmp_path / "out" / "verdict.html").read_text("utf-8")
     assert "settled loop tolerates a secondary path that is wrong by" in page
     assert data["ceilings"]["coherence_db"] is None
-    d, s = (read_recording(folder / f"{name}.wav").one_channel() for name in ("d", "S"))
-    half = d[d.size // 2 :] - d.mean()
-    free = wiener_solution(predictor_reference(half), Plant(s, fs=16000), n_taps=32, disturbance=half)
-    assert data["ceilings"]["filter_db"] == pytest.approx(
-        free.noise_reduction_db, abs=0.2
-    )  # whose stretches differ a bit
 
 
 def test_a_settled_loop_that_a_measured_path_makes_unstable_is_refused(command, folder):

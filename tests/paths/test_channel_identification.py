@@ -117,6 +117,9 @@ NOISES = np.random.default_rng(0).standard_normal((3, 100))
 @pytest.mark.parametrize(
     ("sent", "heard", "message"),
     [
+        (np.ones(10), np.ones(9), "response must have 10 samples"),
+        (np.ones(4), np.ones(4), "excitation must have at least 7"),
+        (np.zeros(10), np.ones(10), "excitation must not be silent"),
         (NOISES[[0, 0]], NOISES, r"excitation\[1\] must not be correlated with excitation\[0\]"),
         ([NOISES[0, 2:], -NOISES[0, :-2]], NOISES[:, 2:], r"excitation\[1\] must not be correlated"),
         (NOISES[:2] * [[1], [0]], NOISES, r"excitation\[1\] must not be silent"),

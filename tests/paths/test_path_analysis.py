@@ -51,8 +51,6 @@ def arriving(primary, secondary, n_taps=64):
     ("call", "message"),
     [
         (lambda: frequency_response([1.0], [9000.0], fs=FS), "frequencies_hz must lie within 0 to fs/2"),
-        (lambda: secondary_path_gain([1.0], band=(1.0, 2.0), reference=[1.0]), "exclude each other"),
-        (lambda: secondary_path_gain([1.0], band=(1.0, 2.0)), "fs must be given"),
         (lambda: secondary_path_gain([1.0, 1.0], reference=[1.0]), "reference must have at least 2"),
         (lambda: achieved_band([0.0], fs=FS), "path must not be all zeros"),
         (lambda: secondary_path_gain([1.0], reference=[0.0, 0.0]), "reference must not be silent"),
@@ -79,20 +77,10 @@ def test_causality_margin_of_delays_is_their_difference(primary, secondary, gain
     assert margin.margins_s.tolist() == [[margin.margin_s]]
 
 
-@given(taps=TAPS, low=st.floats(0, 3000), width=st.floats(10, 5000))
-@settings(max_examples=30, deadline=None)
-def test_gain_over_a_band_is_the_mean_of_the_squared_response(taps, low, width):
-    n = 4000
-    frequencies = low + width * (np.arange(n) + 0.5) / n
-    mean = np.mean(np.abs(frequency_response(taps, frequencies, fs=FS)) ** 2)
-    gain = secondary_path_gain(taps, band=(low, low + width), fs=FS)
-    # Midpoint rule with 4000 points on a cosine series of 30 terms; the absolute part is rounding.
-    assert gain == pytest.approx(mean, rel=1e-4, abs=1e-9)
-
-
 def test_gain_for_a_reference_is_equation_11():
     path = bandpass_path(32, fs=FS)
-    assert secondary_path_gain(path) == pytest.approx(secondary_path_gain(path, band=(0.0, FS / 2)), rel=1e-12)
+    response = frequency_response(path, (np.arange(64) + 0.5) * FS / 128)  # twice as many as taps: the mean is exact
+    assert secondary_path_gain(path) == pytest.approx(np.mean(np.abs(response) ** 2), rel=1e-12)
     # A tone of whole periods: |S|² at its frequency.
     tone = np.sin(2 * np.pi * 400 * np.arange(4000 + 31) / FS)
     expected = np.abs(frequency_response(path, [400.0])[0]) ** 2
@@ -149,8 +137,6 @@ def test_a_recording_taken_for_a_path_is_analysed_in_seconds():
     began = time.process_time()
     margin = causality_margin(Plant(np.eye(1, 8, 4)[0], taps, fs=FS))
     band = achieved_band(taps, fs=FS)
-    gain = secondary_path_gain(taps, band=(0.0, FS / 2), fs=FS)
     assert time.process_time() - began < 10
     assert margin.margin_samples == pytest.approx(119_996)
     assert band.high_hz == pytest.approx(np.arccos(10 ** (-3 / 20)) * FS / np.pi, abs=1e-3)
-    assert gain == pytest.approx(0.5)

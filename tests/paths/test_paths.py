@@ -1,8 +1,5 @@
 """Band-pass and user paths, their taps, perturbed copies. Oracles: scipy.signal, numpy.fft, closed forms."""
 
-import subprocess
-import sys
-
 import control
 import numpy as np
 import pytest
@@ -65,18 +62,6 @@ def test_taps_of_an_array_are_padded_and_cut():
     np.testing.assert_array_equal(path_taps([1, 2]), [1.0, 2.0])
     np.testing.assert_array_equal(path_taps([1, 2], n_taps=4), [1.0, 2.0, 0.0, 0.0])
     np.testing.assert_array_equal(path_taps([1, 2, 1e-9], n_taps=2), [1.0, 2.0])
-
-
-def test_taps_of_an_array_need_no_python_control():
-    code = (
-        "import sys; from kfopc_filterpy._taps import path_taps, sampling_rate;"
-        "from kfopc_filterpy.paths import duct_plant, estimate_path;"
-        "from kfopc_filterpy.bounds import wiener_solution;"
-        "from kfopc_filterpy.plot import plot_bode;"
-        "path_taps([1.0, 0.5], n_taps=2);"
-        "assert not {'control', 'matplotlib'} & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def _iir(order=3, low=500, high=3000):

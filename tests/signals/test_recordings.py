@@ -366,16 +366,12 @@ def test_wav_writes_the_tail_of_a_diverged_run_as_silence(tmp_path):
     assert read_recording(tmp_path / "x.wav").samples.tolist() == [0.0]
 
 
-@pytest.mark.parametrize("peak", [None, 8.0])
-def test_two_channels_come_back_as_they_were_written(tmp_path, peak):
+def test_two_channels_come_back_as_they_were_written_and_one_without_its_axis(tmp_path):
     x = np.clip(np.random.default_rng(1).normal(0, 2, (2, 1000)), -8, 8)
-    write_wav(tmp_path / "x.wav", x, 16000, peak=peak)
-    assert soundfile.info(tmp_path / "x.wav").channels == 2
-    read = read_recording(tmp_path / "x.wav").samples
-    expected = x.astype(np.float32) if peak is None else np.round(x / peak * 32767) / 32768
-    np.testing.assert_array_equal(read, expected)
-    write_wav(tmp_path / "y.wav", x[:1], 16000, peak=peak)
-    np.testing.assert_array_equal(read_recording(tmp_path / "y.wav").samples, expected[0])  # one channel drops its axis
+    for peak, expected in ((None, x.astype(np.float32)), (8.0, np.round(x / 8 * 32767) / 32768)):
+        for rows in (slice(2), slice(1)):
+            write_wav(tmp_path / "x.wav", x[rows], 16000, peak=peak)
+            np.testing.assert_array_equal(read_recording(tmp_path / "x.wav").samples, np.squeeze(expected[rows]))
 
 
 def test_the_same_signal_gives_the_same_bytes(tmp_path):
