@@ -12,7 +12,6 @@ import numpy as np
 
 from kfopc_filterpy import OutputPowerConstraint
 from kfopc_filterpy.controllers import Controller, penalty_factor
-from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.controllers.table import MAKERS
 from kfopc_filterpy.power.amplifiers import Amplifier
 from kfopc_filterpy.verdict.candidates import DIAGONAL_STATE_NOISES, FORGOTTEN, STEP_SIZES
@@ -106,6 +105,8 @@ class Algorithm:
         first = setting[0] if isinstance(setting, tuple) else setting
         if self.symbol == "r":
             return first * scene.measurement_noise / scene.filtered_power
+        if self.symbol == "averaging_s":
+            return first * scene.averaging_s
         return first / (scene.n_taps * scene.filtered_power) if self.symbol == "mu" else first
 
 
@@ -224,7 +225,7 @@ ONE_CHANNEL = (
 Tried = tuple[str, str, tuple[float, ...], tuple[float, ...]]  # symbol and kind of the first setting, and both grids
 _RANDOM_WALK: Tried = ("r", "r E[x'^2]/q", STATE_NOISE_GRID, ())
 _DIAGONAL: Tried = ("r", "r E[x'^2]/q", DIAGONAL_STATE_NOISES, ())
-_BUDGET: Tried = ("averaging_s", "averaging time in s", (DEFAULT_AVERAGING_S,), ())
+_BUDGET: Tried = ("averaging_s", "averaging time over the scene's", (1.0,), ())
 _LEAST_FORGOTTEN: Tried = ("1 - lambda", "1 - lambda", FORGOTTEN, ())
 _STEP: Tried = ("mu", "mu L E[x'^2]", STEP_SIZES[::-1], ())
 _STEP_AND_PRICE: Tried = (*_STEP[:3], PRICE_GRID)  # leak over E[x'^2], or penalty factor over G_s

@@ -21,6 +21,7 @@ from kfopc_filterpy.bounds import (
 )
 from kfopc_filterpy.bounds.wiener import full_stretch
 from kfopc_filterpy.controllers import Controller
+from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.plant import checked_references, has_one_channel
 from kfopc_filterpy.power.amplifiers import Amplifier
 from kfopc_filterpy.verdict.candidates import filtered_power
@@ -122,6 +123,8 @@ class Scene:
         Memory in seconds of the power estimates of the constrained algorithms.
     power_window : {"exponential", "sliding"}, default "exponential"
         Window of these estimates.
+    averaging_s : float, default 10
+        Time in seconds over which KF-PB keeps the rated power as a mean.
     """
 
     fs: float
@@ -144,6 +147,7 @@ class Scene:
     known_amplifier: Amplifier | Sequence[Amplifier] | None = None
     power_memory_s: float = 0.5
     power_window: str = "exponential"
+    averaging_s: float = DEFAULT_AVERAGING_S
 
     @property
     def sensor_noise_seeds(self) -> list[int]:

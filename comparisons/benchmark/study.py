@@ -24,6 +24,7 @@ from ..bench.registry import registered
 from ..bench.tuning import BUDGET
 from .blocks import CommandController, EntryFailed
 from .entries import entries_for, peers, rivals
+from .event_figure import event_figure
 from .tasks import FOLDER, JUDGED, LeftOut, Task, read_task
 
 SHARE = 0.9  # of the steady noise reduction, that is reached after a time
@@ -47,10 +48,11 @@ class Score:
     power : float
         Output power over that half, divided by the rated power, of the loudspeaker for which this is largest.
     loudest_second_db : float
-        Power of the error relative to that of the disturbance in dB, in the second in which this is largest.
+        Power of the error relative to that of the disturbance in dB, in the second in which this is largest; those
+        before the change do not count.
     time_s : float
-        Time from the last change of the plant until 90 % of the steady noise reduction in dB is reached; NaN if the
-        noise is not reduced.
+        Time from the end of the change until 90 % of the steady noise reduction in dB is reached; NaN if the noise is
+        not reduced.
     cost : float
         Processor time of a run, divided by that of FxLMS; for a command, the elapsed time divided by the same.
     setting : float or tuple of float, optional
@@ -83,8 +85,10 @@ def score(task: Task, name: str, result: SimulationResult, bound_db: float) -> S
     reduction = noise_reduction_db(e, d)
     power = float(np.max(output_power(result.control_signal) / task.rated_power))
     seconds = np.array_split(np.arange(e.shape[1]), max(round(e.shape[1] / task.fs), 1))
-    loudest = max(-noise_reduction_db(e[:, part], d[:, part], steady=1.0) for part in seconds)
-    change, window = round(task.changed_at_s * task.fs), round(task.nse_window_s * task.fs)
+    later = [part for part in seconds if part[-1] >= task.changed_at_s * task.fs]
+    loudest = max(-noise_reduction_db(e[:, part], d[:, part], steady=1.0) for part in later)
+    change = round((task.changed_at_s + task.change.lasting_s) * task.fs)
+    window = round(task.nse_window_s * task.fs)
     curve = -nse_db(e[:, change:], d[:, change:], task.fs, task.nse_window_s)
     curve[: window - 1] = np.nan  # shorter windows
     reached = np.flatnonzero(curve >= SHARE * reduction) if reduction > 0.0 else np.array([])
@@ -166,7 +170,22 @@ def table(outcome: Mapping[str, Any]) -> str:
             f"{one.entry:31}{one.noise_reduction_db:8.2f}{lost:>10} {one.power:7.2f}{one.loudest_second_db:11.2f}"
             f"{one.time_s:14.3f}{one.cost:8.1f}  {settings}"
         )
-    return "\n".join(lines)
+    return "\n".join([*lines, place(scores)]).rstrip()
+
+
+def place(scores: Sequence[Score], name: str = "KF-PB") -> str:
+    """Return the place of an entry in a sentence; nothing if it has none."""
+    first, *others = (one for one in scores if not one.failed)
+    own = next((one for one in (first, *others) if one.entry == name), None)
+    if own is None:
+        return ""
+    said = f"{name} has place {scores.index(own) + 1} of {len(scores)}"
+    if own is not first:
+        return f"{said}, {first.noise_reduction_db - own.noise_reduction_db:.2f} dB behind {first.entry}."
+    kept = [one for one in others if one.within_rating]
+    return said + (
+        f", {own.noise_reduction_db - kept[0].noise_reduction_db:.2f} dB ahead of {kept[0].entry}." if kept else "."
+    )
 
 
 def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = None) -> int:
@@ -200,13 +219,15 @@ def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = Non
         prepare_folder(options.output)
     except OSError as error:
         parser.error(str(error))
-    entries: dict[str, Entry] = {**rivals(), **peers(), **(objects or {}), **commands}
+    entries: dict[str, Entry] = {**(objects or {}), **commands}
     runs, outcomes = Runs(), []
     with one_blas_thread(), warnings.catch_warnings():  # as in the runs that are timed
         warnings.simplefilter("ignore", RuntimeWarning)  # of filters that diverge while they are tuned
         for path in files:
             try:
-                outcomes.append(run_task(runs, read_task(path), entries, options.only))
+                task = read_task(path)
+                others = {**rivals(), **(peers() if task.other_packages else {})}
+                outcomes.append(run_task(runs, task, {**others, **entries}, options.only))
             except LeftOut as error:
                 print(f"{path.stem}: left out, {error}\n", flush=True)
                 continue
@@ -219,6 +240,8 @@ def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = Non
         }
         for outcome in outcomes
     }
+    if figure := event_figure(outcomes):
+        figure.savefig(options.output / "events.png", dpi=150)
     written = options.output / "benchmark.json"
     write_whole(written, json.dumps({"version": __version__, "tasks": found}, indent=1) + "\n")
     print(f"{written} written")

@@ -17,13 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import Plant, bandpass_path, power_constrained_wiener
+from kfopc_filterpy import Plant, SimulationResult, bandpass_path, power_constrained_wiener
 from kfopc_filterpy._validate import as_choice
+from kfopc_filterpy.bounds import PowerConstrainedWiener
 from kfopc_filterpy.controllers import Controller
+from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.paths import duct_plant
 from kfopc_filterpy.signals import band_limited_noise, compressor_noise, tone
 
 from ..bench import Scene, make_scene
+from ..bench.changes import CHANGES, Change
 from ..bench.noises import looped
 from ..bench.scene import reachable_weights
 from ..studies.cases import measured_data, of_unit_gain
@@ -56,10 +59,12 @@ class Task(Scene):
         Samples of a block.
     primary : ndarray, shape (K, I, n_taps)
         Primary path, for entries that are designed by a measurement of it.
+    change : Change
+        What changes during the run. Controllers know the plant before it.
     changed_at_s : float
-        Time of the change of the plant; 0 if nothing changes.
-    secondary_factor : float
-        Factor by which the change multiplies the secondary path. Controllers know the path before it.
+        Time of the change; 0 if nothing changes.
+    other_packages : bool
+        Whether the filters of other packages enter.
     """
 
     name: str = ""
@@ -67,29 +72,39 @@ class Task(Scene):
     digest: str = ""
     block: int = 0
     primary: Any = None
+    change: Change = CHANGES["nothing"]
     changed_at_s: float = 0.0
-    secondary_factor: float = 1.0
+    other_packages: bool = True
 
     def plant_of(self, controller: Controller) -> Plant:
         """Return the plant of a run; a controller with `plays_blocks` delays its control signal itself."""
         path = self.secondary[..., self.block if getattr(controller, "plays_blocks", False) else 0 :]
-        plant = replace(self, secondary=path).plant
-        if self.secondary_factor == 1.0:
-            return plant
-        return plant.changed_at(self.changed_at_s, secondary=self.secondary_factor * path)
+        return self.change.plant(replace(self, secondary=path).plant, self.changed_at_s)
+
+    def run_together(self, *own: Any, **options: Any) -> list[SimulationResult]:
+        """Run controllers as a scene does, on what the reference microphone delivers."""
+        return Scene.run_together(replace(self, references=self.heard), *own, **options)
+
+    @property
+    def heard(self) -> list[np.ndarray]:
+        """What the reference microphone delivers of each noise."""
+        return [self.change.reference(x, round(self.changed_at_s * self.fs), self.fs) for x in self.references]
+
+    def bound(self, from_s: float) -> PowerConstrainedWiener:
+        """Return the best fixed filters within the rated power from a time on, for the plant after the change."""
+        with reachable_weights():
+            return power_constrained_wiener(
+                self.references[JUDGED],
+                self.change.plant(Plant(self.secondary, fs=self.fs), self.changed_at_s).at(from_s),
+                n_taps=self.n_taps,
+                rated_power=self.rated_power,
+                disturbance=self.disturbances[JUDGED],
+                switch_on_s=from_s,
+            )
 
     def bound_db(self) -> float:
         """Return the noise reduction of the best fixed filter within the rated power, over the half that counts."""
-        x, d = self.references[JUDGED], self.disturbances[JUDGED]
-        with reachable_weights():
-            bound = power_constrained_wiener(
-                x,
-                Plant(self.secondary_factor * self.secondary, fs=self.fs),
-                n_taps=self.n_taps,
-                rated_power=self.rated_power,
-                disturbance=d,
-                switch_on_s=x.shape[-1] / self.fs / 2,
-            ).whole
+        bound = self.bound(self.references[JUDGED].shape[-1] / self.fs / 2).whole
         left = np.mean(bound.error**2) + self.sensor_noise_std**2
         return float(-10 * np.log10(left / np.mean(bound.stretch.d**2)))
 
@@ -141,10 +156,6 @@ def _compressor(duration_s: float, *, fs: float, rng: int) -> np.ndarray:
     return compressor_noise(duration_s, fs=fs, rng=rng)
 
 
-def _change(*, at_s: float = 0.0, primary_factor: float = 1.0, secondary_factor: float = 1.0) -> dict[str, float]:
-    return {"at_s": at_s, "primary_factor": primary_factor, "secondary_factor": secondary_factor}
-
-
 NOISES: dict[str, Callable[..., np.ndarray]] = {
     "band": _band,
     "compressor": _compressor,
@@ -164,7 +175,13 @@ PATHS: dict[str, Callable[..., Plant]] = {
 
 def read_task(path: Path) -> Task:
     """Return the task of a file; raise `LeftOut` if this machine lacks its data."""
-    return _made(_task, tomllib.loads(path.read_text(encoding="utf-8")), path.name, path=path)
+    return _made(_task, _definition(path), path.name, path=path)
+
+
+def _definition(path: Path) -> dict[str, Any]:
+    """Return what a file says, with what it leaves out as in the task that it is `like`."""
+    own = tomllib.loads(path.read_text(encoding="utf-8"))
+    return _definition(FOLDER / f"{own.pop('like')}.toml") | own if "like" in own else own
 
 
 def _made(make: Callable[..., Any], table: Mapping[str, Any], where: str, **own: Any) -> Any:
@@ -198,18 +215,20 @@ def _task(
     signals_sha256: str,
     paths: Mapping[str, Any],
     noise: Mapping[str, Any],
-    change: Mapping[str, Any] | None = None,
+    change: str = "nothing",
+    changed_at_s: float = 0.0,
     path_error: float | None = None,
+    averaging_s: float = DEFAULT_AVERAGING_S,
+    other_packages: bool = True,
 ) -> Task:
     plant = _of_model(PATHS, paths, f"{path.name}, [paths]", fs=fs)
     own = {"duration_s": duration_s, "fs": fs}
     noises = {seed: _of_model(NOISES, noise, f"{path.name}, [noise]", rng=seed, **own) for seed in SEEDS}
-    changed = _made(_change, change or {}, f"{path.name}, [change]")
-    _require_same_signals(path, signals_sha256, [plant.primary, plant.secondary, *noises.values()])
-    delayed = np.pad(plant.secondary, ((0, 0), (0, 0), (block, 0)))
+    changed, at = CHANGES[as_choice(change, f"{path.name}: change", CHANGES)], round(changed_at_s * fs)
+    delayed = Plant(np.pad(plant.secondary, ((0, 0), (0, 0), (block, 0))), plant.primary, fs=fs)
     scene = make_scene(
         noises,
-        Plant(delayed, plant.primary, fs=fs),
+        delayed,
         rated_power=rated_power,
         power_multiple=needed_power,
         n_taps=n_taps,
@@ -217,23 +236,40 @@ def _task(
         sensor_noise_db=SENSOR_NOISE_DB,
         nse_window_s=NSE_WINDOW_S,
     )
-    for d in scene.disturbances:
-        d[..., round(changed["at_s"] * fs) :] *= changed["primary_factor"]
-    return Task(
-        **vars(scene) | {"secondary_path_uncertainty": path_error},
+    sound = [changed.noise(x, at, fs) for x in scene.references]
+    told = {
+        "references": sound,
+        "disturbances": [changed.disturbance(delayed.disturbance(x), at, fs) for x in sound],
+        "secondary_path_uncertainty": path_error,
+        "averaging_s": averaging_s,
+    }
+    task = Task(
+        **vars(scene) | told,
         name=path.stem,
-        title=title,
+        title=title if change == "nothing" else f"{title}; at {changed_at_s:g} s: {change}",
         digest=digest_of(path),
         block=block,
         primary=plant.primary,
-        changed_at_s=changed["at_s"],
-        secondary_factor=changed["secondary_factor"],
+        change=changed,
+        changed_at_s=changed_at_s,
+        other_packages=other_packages,
     )
+    signals = [plant.primary, plant.secondary, *noises.values()]
+    if change != "nothing":
+        later = changed.plant(delayed, changed_at_s).at(duration_s).secondary
+        signals += [
+            np.concatenate([delayed.secondary, later], axis=-1),
+            *task.references,
+            *task.heard,
+            *task.disturbances,
+        ]
+    _require_same_signals(path, signals_sha256, signals)
+    return task
 
 
 def digest_of(path: Path) -> str:
     """Return the hash of a definition, regardless of comments and spaces."""
-    definition = json.dumps(tomllib.loads(path.read_text(encoding="utf-8")), sort_keys=True)
+    definition = json.dumps(_definition(path), sort_keys=True)
     return hashlib.sha256(definition.encode()).hexdigest()[:12]
 
 

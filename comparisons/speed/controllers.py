@@ -19,13 +19,16 @@ from .timing import Work
 
 R, Q, P0 = 1e-8, 1.0, 1e-3
 SHARING = 64
+WHOLE_RUN_S = 20.0  # of KF-PB, which factorises its posterior again and again as long as it runs
 PLANT = Plant(np.random.default_rng(0).standard_normal(32) / 8, fs=16000)  # of the closed loops
 TARGET_FLOPS = 1e8  # of a turn
 TAPS = (16, 64, 128, 256, 512, 1024)
 
 
-def samples_for(taps: int, most: int, least: int) -> int:
-    """Return the number of samples of a turn."""
+def samples_for(taps: int, most: int, least: int, name: str = "") -> int:
+    """Return the number of samples of a turn, those of a whole run for KF-PB."""
+    if name == "KF-PB":
+        return round(WHOLE_RUN_S * PLANT.fs)
     return int(np.clip(TARGET_FLOPS / (3 * taps**2), least, most))
 
 
@@ -52,14 +55,14 @@ CONTROLLERS: dict[str, Callable[[int], Any]] = {
 
 def simulated(name: str, taps: int) -> Work:
     """Return the work of a controller in `simulate`: amplifier, paths, power estimates, records."""
-    samples = samples_for(taps, most=20000, least=2000)
+    samples = samples_for(taps, most=20000, least=2000, name=name)
     x, d = noises(samples)
     return partial(simulate, CONTROLLERS[name](taps), x, PLANT, disturbance=d), samples
 
 
 def stepped(name: str, taps: int) -> Work:
     """Return the work of a controller stepped from Python, two calls a sample, without a loop around it."""
-    controller, samples = CONTROLLERS[name](taps), samples_for(taps, most=1000, least=200)
+    controller, samples = CONTROLLERS[name](taps), samples_for(taps, most=1000, least=200, name=name)
     x, d = noises(samples)
 
     def run() -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,17 +13,49 @@ from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.signals import band_limited_noise
 
 from ..bench import Claim, Parameter, Runs, StudyReport, Table
-from ..bench.noises import level_jump
+from ..bench.changes import CHANGES
 from ..bench.scene import reachable_weights
 from .report_parts import report_of_rows
 
 FS, N_TAPS, RATED = 16000.0, 160, 2.1
 SECONDARY = np.array([0.0, 0.0, 0.0, 1.0, -0.8])  # a loudspeaker that is weak at low frequencies
-DELAY = 40  # samples of the primary path
+PLANT = Plant(SECONDARY, np.eye(60)[40], fs=FS)
 BAND_HZ = (100.0, 2000.0)
 SENSOR_NOISE = 0.01
 AFTER_S = 10.0  # that are judged after an event
 SEED = 1
+EVENTS: dict[str, tuple[str, float, dict[str, float]]] = {  # by name: what changes, when in s, settings of KF-PB
+    "nothing": ("nothing", 8.0, {}),
+    "start without a silent run": ("nothing", 0.0, {}),
+    "start, ample power": ("nothing", 0.0, {"rated_power": 20.0}),
+    **{f"primary path's sign at {t:g} s": ("primary path's sign", t, {}) for t in (0.4, 0.7, 1.0, 8.0)},
+    **{f"secondary path's sign at {t:g} s": ("secondary path's sign", t, {}) for t in (0.4, 1.0, 8.0)},
+    **{
+        what: (what, at_s, {})
+        for what, at_s in {
+            "primary path 5 samples late": 8.0,
+            "secondary path 2 samples late": 8.0,
+            "secondary path 6 dB louder": 8.0,
+            "secondary path 6 dB softer": 8.0,
+            "noise 12 dB softer": 12.0,
+            "noise 12 dB louder": 12.0,
+            "reference dead for 10 s": 8.0,
+            "a reference sample of 1e4": 8.0,
+            "soft past, 1e-3": 6.0,
+            "soft past, 1e-6": 6.0,
+            "fades in over 4 s from 1e-4": 6.0,
+            "drift of 2 % of a sample a second": 4.0,
+            "drift of 20 % of a sample a second": 4.0,
+            "seams of a recording": 3.7,
+            "error microphone clips at 0.1": 0.0,
+            "error microphone clips at 0.5": 0.0,
+        }.items()
+    },
+    "averaging_s=600, sign at 30 s": ("primary path's sign", 30.0, {"averaging_s": 600.0}),
+    "averaging_s=1, sign at 8 s": ("primary path's sign", 8.0, {"averaging_s": 1.0}),
+    "48 kHz": ("nothing", 4.0, {"fs": 48000.0}),
+    "48 kHz, seams": ("seams of a recording", 3.7, {"fs": 48000.0}),
+}
 
 
 @dataclass(frozen=True)
@@ -39,9 +69,8 @@ class Event:
     begins: int  # sample of the event
     judged: int  # sample from which on the losses are counted: its end
     sound: np.ndarray  # the reference without faults, of which the bound knows
-    limit: float = np.inf  # at which the error microphone clips
-    settings: dict[str, Any] = field(default_factory=dict)
-    rated_power: float = RATED
+    limit: float  # at which the error microphone clips
+    settings: dict[str, Any]  # of KF-PB
 
 
 class ClippingMicrophone:
@@ -72,106 +101,18 @@ class EventRow:
     power: float  # largest over any averaging time, over the rated one
 
 
-def scene(
-    name: str,
-    before_s: float,
-    *,
-    primary: Callable[[np.ndarray], np.ndarray] = lambda d: d,
-    secondary: np.ndarray | None = None,
-    gain: Callable[[np.ndarray], np.ndarray] | None = None,
-    heard: Callable[[np.ndarray], np.ndarray] | None = None,
-    lasting_s: float = 0.0,
-    fs: float = FS,
-    drift: float = 0.0,
-    **settings: float,
-) -> Event:
-    """Return an event of the plant of the README. `gain` and `heard` change noise and reference, from the event on."""
-    at, end = round(before_s * fs), round((before_s + lasting_s) * fs)
+def event(name: str) -> Event:
+    """Return a run of the plant of the README."""
+    what, at_s, own = EVENTS[name]
+    change, settings = CHANGES[what], {"fs": FS, "rated_power": RATED} | own
+    fs = settings["fs"]
+    at, end = round(at_s * fs), round((at_s + change.lasting_s) * fs)
     n = end + round(AFTER_S * fs)
-    x = band_limited_noise(BAND_HZ, n / fs, fs=fs, rng=SEED)
-    x = x if gain is None else gain(x)
-    d = np.concatenate([np.zeros(DELAY), x[: n - DELAY]])
-    if drift:  # samples a second
-        t = np.arange(n)
-        d = np.interp(t - drift * np.maximum(t - at, 0) / fs, t, d)
-    d = np.concatenate([d[:at], primary(d)[at:]])
-    d += SENSOR_NOISE * np.random.default_rng(SEED + 1).standard_normal(n)
-    reference = x if heard is None else heard(x)
-    own = {key: settings.pop(key) for key in ("limit", "rated_power") if key in settings}
-    plant = Plant(SECONDARY, fs=fs)
-    plant = plant if secondary is None else plant.changed_at(before_s, secondary=secondary)
-    return Event(name, reference, d, plant, at, end, x, settings=settings, **own)
-
-
-def _late(d: np.ndarray, taps: int = 5) -> np.ndarray:
-    return np.concatenate([np.zeros(taps), d[:-taps]])
-
-
-def _dead(x: np.ndarray, begin_s: float, end_s: float) -> np.ndarray:
-    return np.concatenate(
-        [x[: round(begin_s * FS)], np.zeros(round(end_s * FS) - round(begin_s * FS)), x[round(end_s * FS) :]]
-    )
-
-
-def _click(x: np.ndarray, at_s: float, size: float) -> np.ndarray:
-    x = x.copy()
-    x[round(at_s * FS)] = size * np.sqrt(np.mean(x**2))
-    return x
-
-
-def _soft(x: np.ndarray, until_s: float, level: float, fade_s: float = 0.0) -> np.ndarray:
-    t = np.arange(x.size) / FS
-    grown = (
-        np.interp(t, [until_s - fade_s, until_s], [np.log(level), 0.0])
-        if fade_s
-        else np.where(t < until_s, np.log(level), 0.0)
-    )
-    return x * np.exp(grown)
-
-
-def _seams(x: np.ndarray, each_s: float, fs: float = FS) -> np.ndarray:
-    return np.resize(x[: round(each_s * fs)], x.size)
-
-
-def events() -> dict[str, Callable[[], Event]]:
-    """Return how each event is made, by its name."""
-    louder = partial(level_jump, fs=FS)
-    made = {
-        "nothing": partial(scene, before_s=8.0),
-        "start without a silent run": partial(scene, before_s=0.0),
-        "start, ample power": partial(scene, before_s=0.0, rated_power=20.0),
-        **{
-            f"primary path's sign at {t:g} s": partial(scene, before_s=t, primary=np.negative)
-            for t in (0.4, 0.7, 1.0, 8.0)
-        },
-        **{
-            f"secondary path's sign at {t:g} s": partial(scene, before_s=t, secondary=-SECONDARY)
-            for t in (0.4, 1.0, 8.0)
-        },
-        "primary path 5 samples late": partial(scene, before_s=8.0, primary=_late),
-        "secondary path 2 samples late": partial(
-            scene, before_s=8.0, secondary=np.concatenate([np.zeros(2), SECONDARY])
-        ),
-        "secondary path 6 dB louder": partial(scene, before_s=8.0, secondary=2.0 * SECONDARY),
-        "secondary path 6 dB softer": partial(scene, before_s=8.0, secondary=0.5 * SECONDARY),
-        "noise 12 dB softer": partial(scene, before_s=12.0, gain=lambda x: louder(x, 12.0, -12.0)),
-        "noise 12 dB louder": partial(scene, before_s=12.0, gain=lambda x: louder(x, 12.0, 12.0)),
-        "averaging_s=600, sign at 30 s": partial(scene, before_s=30.0, primary=np.negative, averaging_s=600.0),
-        "averaging_s=1, sign at 8 s": partial(scene, before_s=8.0, primary=np.negative, averaging_s=1.0),
-        "reference dead for 10 s": partial(scene, before_s=8.0, lasting_s=10.0, heard=lambda x: _dead(x, 8.0, 18.0)),
-        "a reference sample of 1e4": partial(scene, before_s=8.0, heard=lambda x: _click(x, 8.0, 1e4)),
-        "soft past, 1e-3": partial(scene, before_s=6.0, gain=lambda x: _soft(x, 6.0, 1e-3)),
-        "soft past, 1e-6": partial(scene, before_s=6.0, gain=lambda x: _soft(x, 6.0, 1e-6)),
-        "fades in over 4 s from 1e-4": partial(scene, before_s=6.0, gain=lambda x: _soft(x, 6.0, 1e-4, 4.0)),
-        "drift of 2 % of a sample a second": partial(scene, before_s=4.0, drift=0.02),
-        "drift of 20 % of a sample a second": partial(scene, before_s=4.0, drift=0.2),
-        "seams of a recording": partial(scene, before_s=3.7, gain=lambda x: _seams(x, 3.7)),
-        "48 kHz": partial(scene, before_s=4.0, fs=48000.0),
-        "48 kHz, seams": partial(scene, before_s=3.7, fs=48000.0, gain=lambda x: _seams(x, 3.7, 48000.0)),
-        "microphone clips at 0.1": partial(scene, before_s=0.0, limit=0.1),
-        "microphone clips at 0.5": partial(scene, before_s=0.0, limit=0.5),
-    }
-    return {name: partial(make, name) for name, make in made.items()}
+    x = change.noise(band_limited_noise(BAND_HZ, n / fs, fs=fs, rng=SEED), at, fs)
+    d = change.disturbance(PLANT.disturbance(x), at, fs)
+    d = d + SENSOR_NOISE * np.random.default_rng(SEED + 1).standard_normal(n)
+    plant = change.plant(Plant(SECONDARY, fs=fs), at_s)
+    return Event(name, change.reference(x, at, fs), d, plant, at, end, x, change.limit, settings)
 
 
 def bound_error(event: Event) -> np.ndarray:
@@ -186,7 +127,7 @@ def bound_error(event: Event) -> np.ndarray:
             n_taps=N_TAPS,
             disturbance=event.disturbance[part],
             switch_on_s=past / fs,
-            rated_power=event.rated_power,
+            rated_power=event.settings["rated_power"],
         )
     error: np.ndarray = bound.per_second.error
     return error
@@ -223,25 +164,25 @@ def judge(event: Event, error: np.ndarray, y: np.ndarray, alarms: int) -> EventR
         [float(v) for v in lost],
         loudest(fs),
         loudest(fs // 10),
-        overshoot(y, event.rated_power, event.plant.fs, window_s=averaging_s),
+        overshoot(y, event.settings["rated_power"], event.plant.fs, window_s=averaging_s),
     )
 
 
 def event_row(name: str) -> EventRow:
     """Run KF-PB through an event."""
-    event = events()[name]()
-    controller = kf_pb(N_TAPS, SECONDARY, rated_power=event.rated_power, fs=event.plant.fs, **event.settings)
-    return judge(event, *played(event, controller), controller.alarms)
+    own = event(name)
+    controller = kf_pb(N_TAPS, SECONDARY, **own.settings)
+    return judge(own, *played(own, controller), controller.alarms)
 
 
 def planned_runs() -> int:
     """Return the number of events."""
-    return len(events())
+    return len(EVENTS)
 
 
 def main(runs: Runs) -> StudyReport:
     """Run KF-PB through all events."""
-    rows = list(runs.map(event_row, list(events())))
+    rows = list(runs.map(event_row, list(EVENTS)))
     headings = [
         "event",
         "lost, second 1 (dB)",

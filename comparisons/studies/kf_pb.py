@@ -15,6 +15,7 @@ from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.metrics import overshoot
 
 from ..bench import Claim, FigureItem, Parameter, Runs, StudyReport, Table
+from ..bench.tuning import BUDGET
 from . import kf_pb_cases as cases
 from .cases import FS, SENSOR_NOISE_DB
 from .kf_pb_cases import CHANGING, FAULTS, STEADY, Rated, make_rated
@@ -145,7 +146,7 @@ def best_mov_db(case: Rated) -> float:
         own = {"rated_power": rated} if penalty is None else {"penalty_factor": penalty}
         result = case.run(mov_fx_lms(cases.N_TAPS, case.plant, step_size=step, **own))
         if result.diverged_at_s is None:
-            kept = overshoot(result.control_signal, rated, FS, window_s=DEFAULT_AVERAGING_S) <= 1.0
+            kept = overshoot(result.control_signal, rated, FS, window_s=DEFAULT_AVERAGING_S) <= BUDGET
             best = max(best, case.reduction_db(result.error)) if kept else best
     return best
 

@@ -58,12 +58,13 @@ def test_the_page_shows_scores_of_the_tasks_as_they_are() -> None:
 
 
 def test_a_task_says_that_its_signals_are_no_longer_those_of_its_hash(tmp_path: Path) -> None:
-    text = FILES[0].read_text(encoding="utf-8")
+    task = FOLDER / "bandpass.toml"
+    text = task.read_text(encoding="utf-8")
     other = tmp_path / "other.toml"
     other.write_text(text + "\n# a comment\n", encoding="utf-8")
-    assert tasks.digest_of(other) == tasks.digest_of(FILES[0])
+    assert tasks.digest_of(other) == tasks.digest_of(task)
     other.write_text(text.replace("1500.0", "1400.0"), encoding="utf-8")
-    assert tasks.digest_of(other) != tasks.digest_of(FILES[0])
+    assert tasks.digest_of(other) != tasks.digest_of(task)
     with pytest.raises(ValueError, match=r"other.toml was made for other signals: their hash is [0-9a-f]{64}, not"):
         read_task(other)
 
@@ -71,16 +72,48 @@ def test_a_task_says_that_its_signals_are_no_longer_those_of_its_hash(tmp_path: 
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("at_s =", "at =", r"\[change\] has the unknown key at; its keys are at_s \(optional\), primary_factor"),
+        ("n_taps =", "taps =", "changed.toml has the unknown key taps; its keys are title, fs, duration_s, n_taps"),
+        ("title", "change = 'loss'\ntitle", "change must be one of 'nothing', \"primary path's sign\""),
         ('model = "band"', 'model = "hiss"', r"\[noise\]: model must be one of 'band', 'compressor'"),
     ],
 )
 def test_a_misspelt_key_is_refused(tmp_path: Path, old: str, new: str, says: str) -> None:
-    text = (FOLDER / "bandpass-change.toml").read_text(encoding="utf-8")
+    text = (FOLDER / "bandpass.toml").read_text(encoding="utf-8")
     assert text.count(old) == 1
     (tmp_path / "changed.toml").write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(ValueError, match=says):
         read_task(tmp_path / "changed.toml")
+
+
+def test_a_task_takes_what_it_leaves_out_from_the_one_that_it_is_like() -> None:
+    like, own = (read_task(FOLDER / f"event-{name}.toml") for name in ("primary-sign", "secondary-sign"))
+    np.testing.assert_array_equal(like.references, own.references)
+    at = round(like.changed_at_s * like.fs)
+    np.testing.assert_array_equal(like.disturbances[0][:at], own.disturbances[0][:at])
+    np.testing.assert_array_equal(like.disturbances[0][at:], -own.disturbances[0][at:])
+    np.testing.assert_array_equal(own.plant.at(0.0).secondary, -own.plant_of(None).at(own.changed_at_s).secondary)
+    assert (own.n_taps, own.other_packages) == (64, False)
+
+
+def test_controllers_hear_a_fault_of_the_reference_and_settings_do_not() -> None:
+    task, same = (read_task(FOLDER / f"event-{name}.toml") for name in ("reference-click", "primary-sign"))
+    assert task.filtered_power == same.filtered_power  # by which step sizes are scaled
+
+    class Listening:
+        def __init__(self) -> None:
+            self.heard: list[float] = []
+
+        def control_signal(self, reference: float) -> float:
+            self.heard.append(reference)
+            return 0.0
+
+        def update(self, error: float) -> None: ...
+
+    one: Any = Listening()
+    task.run(one, 1)
+    at = round(task.changed_at_s * task.fs)
+    assert max(map(abs, one.heard)) == one.heard[at] > 1e3 * np.max(np.abs(task.references[1]))
+    np.testing.assert_array_equal(np.delete(one.heard, at), np.delete(task.references[1], at))
 
 
 def test_a_task_without_its_data_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,9 +140,21 @@ def test_the_figures_of_a_made_up_run(short: Task) -> None:
     assert one.loudest_second_db == pytest.approx(20 * np.log10(3.0))
     # 90 % of 20 dB are reached when 1 - 0.99 p of the window of 50 ms is 10^-1.8, p = 0.994: 397.7 samples
     assert one.time_s == pytest.approx(0.25 + 397 / fs)
+    later = study.score(replace(task, changed_at_s=3.0), "made up", result, bound_db=23.0)
+    assert later.loudest_second_db == pytest.approx(-20.0)  # before the change, nothing counts
     over = study.score(replace(task, rated_power=0.4), "made up", result, bound_db=23.0)
     assert not over.within_rating
     assert np.isnan(over.below_bound_db)
+
+
+def test_the_place_is_that_in_the_table() -> None:
+    names = {"best": 10.0, "KF-PB": 9.5, "worse": 9.0}
+    scores = [study.Score(name, reduction, power=1.0) for name, reduction in names.items()]
+    over, broken = study.Score("over", 20.0, power=2.0), study.Score("broken", failed="out of order")
+    assert study.place([*scores, over, broken]) == "KF-PB has place 2 of 5, 0.50 dB behind best."
+    assert study.place([*scores[1:], over]) == "KF-PB has place 1 of 3, 0.50 dB ahead of worse."
+    assert study.place([scores[1], over]) == "KF-PB has place 1 of 2."
+    assert study.place([scores[0], broken]) == ""
 
 
 # ---- Entries

@@ -7,17 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from comparisons.bench.changes import CHANGES
 from comparisons.studies import events as study
 from kfopc_filterpy import kf_pb
 
 
-def short(event: study.Event, duration_s: float) -> study.Event:
+def short(name: str, duration_s: float) -> study.Event:
+    event = study.event(name)
     n = round(duration_s * study.FS)
     return replace(event, reference=event.reference[:n], disturbance=event.disturbance[:n], sound=event.sound[:n])
 
 
 def test_the_secondary_path_changes_its_sign_at_the_event() -> None:
-    event = short(study.scene("sign", 0.4, secondary=-study.SECONDARY), 1.0)
+    event = short("secondary path's sign at 0.4 s", 1.0)
     controller = kf_pb(study.N_TAPS, study.SECONDARY, rated_power=study.RATED, fs=study.FS)
     error, y = study.played(event, controller)
     heard = np.convolve(y, study.SECONDARY)[: y.size]
@@ -36,10 +38,39 @@ def test_a_microphone_that_clips_delivers_its_limit_at_most() -> None:
         def update(self, error: float) -> None:
             delivered.append(error)
 
-    event = short(study.scene("clips", 0.0, limit=0.5), 0.1)
+    event = short("error microphone clips at 0.5", 0.1)
     error, _ = study.played(event, Silent())
     np.testing.assert_array_equal(error, event.disturbance)
     np.testing.assert_array_equal(delivered, np.clip(error, -0.5, 0.5))
+
+
+AT, FS = 400, 1000.0
+T = np.arange(1000)
+TONE = np.sin(2 * np.pi * 0.03 * T)
+
+
+@pytest.mark.parametrize(
+    ("what", "signal", "later"),
+    [
+        ("primary path's sign", "disturbance", -TONE),
+        ("primary path 5 samples late", "disturbance", np.sin(2 * np.pi * 0.03 * (T - 5))),
+        ("noise 12 dB softer", "noise", TONE / 3.98107),
+        ("reference dead for 10 s", "reference", 0.0 * TONE),
+        ("a reference sample of 1e4", "reference", np.where(T == AT, 1e4 / np.sqrt(2.0), TONE)),
+        ("soft past, 1e-3", "noise", TONE),
+        (
+            "drift of 20 % of a sample a second",
+            "disturbance",
+            np.sin(2 * np.pi * 0.03 * (T - 0.2 * (T - AT) / FS)),
+        ),
+    ],
+)
+def test_a_change_is_what_its_name_says(what: str, signal: str, later: np.ndarray) -> None:
+    """A tone of 33 samples a period, between whose samples a cubic spline is right to 1e-4."""
+    changed = getattr(CHANGES[what], signal)(TONE, AT, FS)
+    before = 1e-3 * TONE if "past" in what else TONE
+    np.testing.assert_allclose(changed[:AT], before[:AT], atol=1e-4)
+    np.testing.assert_allclose(changed[AT:], later[AT:], atol=1e-4, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["primary path's sign at 1 s", "noise 12 dB softer", "a reference sample of 1e4"])
