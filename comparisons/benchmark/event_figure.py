@@ -16,7 +16,7 @@ from .tasks import JUDGED, Task
 
 SHOWN = ("MOV-FxLMS", "KF-OPC", "KF-PB")
 COLUMNS, WINDOW_S, STEP_S = 4, 0.1, 0.01
-LIMITS_DB = (-10.0, 40.0)
+LIMITS_DB = (-10.0, 42.0)
 
 
 def event_figure(outcomes: Sequence[Mapping[str, Any]]) -> Any:
