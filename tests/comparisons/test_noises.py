@@ -77,12 +77,13 @@ def test_the_background_has_its_level() -> None:
     background together, which is 1, to the same.
     """
     starts, ends = edges(bursts(BURSTS_HZ=0.5, DECAY_S=0.01), 1e-3, hold=40)
-    x = bursts(BURSTS_HZ=0.5, DECAY_S=0.01, BACKGROUND_DB=0.0)
+    x = bursts(BURSTS_HZ=0.5, DECAY_S=0.01, BACKGROUND_DB=-6.0)
+    ratio = 10**-0.6
     pause = np.ones(x.size, dtype=bool)
     for start, end in zip(starts, ends, strict=True):
         pause[max(start - 5, 0) : end + 60] = False
     assert np.sum(pause) > 800_000
-    assert np.mean(x[pause] ** 2) == pytest.approx(0.5, rel=0.025)
+    assert np.mean(x[pause] ** 2) == pytest.approx(ratio / (1 + ratio), rel=0.025)
 
 
 # ---- Swelling
