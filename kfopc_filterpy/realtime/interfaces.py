@@ -137,18 +137,13 @@ class SimulatedInterface:
         self._done = 0
         self.blocks_can_repeat = False  # simulated noise may be exactly periodic
 
-    @property
-    def n_samples(self) -> int:
-        """Samples of the noise."""
-        return self._x.shape[1]
-
     def start(self) -> None:
         """Do nothing: the next block is there at once."""
 
     def read(self) -> Block | None:
         """Return the next block; None if less than a block of the noise is left."""
         now = slice(self._done, self._done + self.block)
-        if now.stop > self.n_samples:
+        if now.stop > self._x.shape[1]:
             return None
         y = self._amplified(self._queue[:, : self.block])
         e = self.disturbance[:, now] - self._secondary(y)
