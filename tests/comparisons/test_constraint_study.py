@@ -112,6 +112,8 @@ def test_the_unconstrained_control_power_is_one(scenes: Any) -> None:
     """1e-6: two ways to solve a system whose condition the ridge bounds; noise is what is left of 1e-16 times 1e8."""
     for noise, scene in scenes.items():
         assert unconstrained_power(scene) == pytest.approx(1.0, rel=1e-6), noise
+        after = scene.disturbances[0][8000:]
+        assert scene.sensor_noise_std**2 / np.mean(after**2) == pytest.approx(1e-4, rel=1e-9)  # 40 dB below
 
 
 def test_measured_data_join_where_they_are_at_hand(shared_data: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -80,6 +80,10 @@ def test_level_of_several_channels_asks_for_a_multiple_of_all_ratings(channels):
     np.testing.assert_allclose(channels.unconstrained_power, power, rtol=1e-3)
     unexplained = (np.mean(d[:, 18:] ** 2, axis=1).sum() - r @ w.ravel()) / 3
     assert channels.measurement_noise == pytest.approx(unexplained + channels.sensor_noise_std**2, rel=1e-2)
+    of_weights = (
+        2 * 8 * np.sum(np.mean(channels.references[0] ** 2, axis=1))
+    )  # two filters of variance 1 for each reference
+    assert channels.initial_variance == pytest.approx(np.sum(channels.unconstrained_power) / of_weights, rel=1e-9)
 
 
 def test_signals_of_several_channels(channels):
