@@ -283,13 +283,20 @@ def test_the_watts_of_the_lead_figure_are_written_out(written):
     assert all(re.fullmatch(r"0\.0*1|10*", text) for text in shown)
 
 
-def test_figures_are_dark_where_the_page_is(written, browser):
-    for scheme, filtered in (("dark", True), ("light", False)):
-        media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+@pytest.mark.parametrize(("scheme", "width"), [("dark", 390), ("light", 1300)])
+def test_the_page_fits_a_phone_and_its_figures_are_dark_where_the_page_is(written, browser, scheme, width):
+    shape = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+    media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", shape)
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+    try:
         browser.get(written[1].as_uri())
-        found = browser.execute_script("return getComputedStyle(document.querySelector('figure img')).filter")
-        assert ("invert" in found) == filtered
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        shown = browser.execute_script("return getComputedStyle(document.querySelector('figure img')).filter")
+        assert ("invert" in shown) == (scheme == "dark")
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
 def test_a_third_octave_that_the_control_makes_louder_is_noted():
