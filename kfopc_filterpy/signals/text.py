@@ -29,10 +29,10 @@ _TIME_UNIT = re.compile(r"\W*?(?:\w+?[\s(\[/_]+)?(seconds?|sec|s|ms|msec|[uµμ\
 _AFTER = r"\b[^\w.+-]*(?:([kmu\u00b5\u03bcn]?)(hz|s)\b[^\w.+-]*)?(\d[\d.,]*(?:e[-+]?\d+)?)(?:\s*,?\s*([kmu\u00b5\u03bcn]?)(hz|s)\b)?"
 _STATED = {
     "hz": re.compile(r"\b(?:sampl\w*[ _-]*(?:rate|freq\w*)|(f_?s|sr))" + _AFTER, re.IGNORECASE),
-    "s": re.compile(r"\b(?:sampl\w*[ _-]*(?:interval|period)|(dt))" + _AFTER, re.IGNORECASE),
+    "s": re.compile(r"\b(?:sampl\w*[ _-]*(?:interval|period)|(dt|delta_x))" + _AFTER, re.IGNORECASE),
 }
-_UNIT = re.compile(  # in brackets, after the slash of "p/Pa", or alone; "mPa/V" is of a path
-    r"(?:[(\[]\s*|^[^(\[]*?/\s*|^\W*)([muk\u00b5\u03bc]?)([Pp]ascals?|Pa|[Vv]olts?|V|A|N|g|m/s(?:\u00b2|\^?2)?)"
+_UNIT = re.compile(  # in brackets, after the slash of "p/Pa", or alone, unless a name; "mPa/V" is of a path
+    r"(?:[(\[]\s*|^[^(\[]*?/\s*|^\W*(?![ANg]\W*$))([muk\u00b5\u03bc]?)([Pp]ascals?|Pa|[Vv]olts?|V|A|N|g|m/s(?:\u00b2|\^?2)?)"
     r"(?:/([muk\u00b5\u03bc]?)(Pa|V|A|N|W))?\s*[)\]]?\W*$"
 )
 PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "\u00b5": 1e-6, "\u03bc": 1e-6, "n": 1e-9}
