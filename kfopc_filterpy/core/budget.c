@@ -462,21 +462,23 @@ static real power_of_now(const budget *f, const real *v)
 }
 
 /* Return the largest factor on the power of filter v that loudspeaker j's account can afford, if
- * its noise goes on for a time: that of the window of x, for which it takes `power`, and that of
- * the last block. */
-static real affordable(const budget *f, int32_t j, const real *v, real power)
+ * its noise goes on for a time: that of the last block; for longer, that of the window of x, for
+ * which v takes `power`; and if a silence has `saved` power, the noise of now for any longer time:
+ * else the saved power would be spent at once, and be missing later. */
+static real affordable(const budget *f, int32_t j, const real *v, real power, real level, int saved)
 {
-    const int32_t T = f->T, blocks[2] = {T / WINDOW_LASTS, T / BLOCK_LASTS};
-    const real powers[2] = {power, power_of_block(f, v)};
-    real factor = 0;
-    for (int c = 0; c < 2; c++) {
-        const real n = (real)blocks[c];
-        const real spent =
-            spent_by(f, j, T - blocks[c]); /* and in the account after n blocks, too */
-        const real left = larger((real)T - spent, LEAST_SHARE * n);
-        const real rated = f->s.setting[RATED_POWER][j];
-        const real afforded = left / n * rated / larger(powers[c], LEAST_POWER);
-        if (c == 0 || afforded < factor) factor = afforded;
+    const int32_t T = f->T, block = T / BLOCK_LASTS, window = T / WINDOW_LASTS;
+    const real rated = f->s.setting[RATED_POWER][j], of_block = power_of_block(f, v);
+    const real of_now = power * (level < 1 ? level : 1);
+    real spent = 0, factor = 0;
+    for (int32_t n = T - 1; n >= block; n--) { /* spent: and in the account after n blocks, too */
+        spent += f->book[times(T - 1 - n, f->s.J) + (size_t)j];
+        const int longer = saved && n > window && n <= T - window;
+        if (!longer && n != window && n != block) continue;
+        const real left = larger((real)T - spent, LEAST_SHARE * (real)n);
+        const real expected = longer ? of_now : n == window ? power : of_block;
+        const real afforded = left / (real)n * rated / larger(expected, LEAST_POWER);
+        if (factor == 0 || afforded < factor) factor = afforded;
     }
     return factor;
 }
@@ -516,8 +518,9 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
     const real cheaper = larger(1 - CHEAPER * larger(left, 0), CHEAPEST);
     real price = larger(f->steady[j] * cheaper, WORTHWHILE * q / (rated * (real)J));
     const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
-    /* 3 The account must afford it. */
-    const real factor = power > 0 ? affordable(f, j, v, power) : 1;
+    /* 3 The account must afford it, and for longer if it holds more than the price follows. */
+    const int saved = CHEAPER * left > 1 - CHEAPEST;
+    const real factor = power > 0 ? affordable(f, j, v, power, level, saved) : 1;
     if (factor < 1) price = price_of(&t, factor * power, price, v);
     f->price[j] = price;
     copy(weights_of(&f->s, j), v, times(I, L));
@@ -646,7 +649,8 @@ static int note(budget *f, const real *error, int controlled)
     return ANC_DONE;
 }
 
-/* Cut clicks from the newest references. */
+/* Cut clicks from the newest references. A sound that sets in after silence is cut, too, until the
+ * peak has grown: nothing is learned from what the delay lines hold of it. */
 static void cut_clicks(budget *f)
 {
     for (int32_t i = 0; i < f->s.I; i++) {
@@ -655,6 +659,7 @@ static void cut_clicks(budget *f)
         if (most > 0 && size > most) {
             size = most;
             *x = *x < 0 ? -most : most;
+            f->posterior.heard[HEARD] = -1 - f->posterior.heard[FILLED];
         }
         f->peak[i] = larger(size, faded(f->peak[i], *f->s.setting[WINDOW], 0));
     }

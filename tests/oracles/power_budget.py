@@ -259,7 +259,7 @@ class PowerBudget(Controller):
         self.x_past, self.y_past = np.zeros((I, history)), np.zeros((J, history))
         self.new = []  # samples of this block: x, y, e, asked^2, or None while silent
         self.peak = np.zeros(I)  # largest magnitude of x of late
-        self.heard = 0  # samples that the delay lines hold
+        self.heard = 0  # samples that the delay lines hold, as they were
         self.R = np.zeros((I, I, self.lags))  # windowed sums of x_i(t) x_i'(t - l)
         self.short = np.zeros((I, I, L))
         self.weights = np.zeros(2)
@@ -277,6 +277,8 @@ class PowerBudget(Controller):
     def hear(self, x):
         """Take the newest references, without clicks."""
         most = np.where(self.peak > 0, GROWTH * self.peak, np.inf)
+        if np.any(np.abs(x) > most):  # false: nothing is learned until the delay lines hold no more of it
+            self.heard = -1 - len(self.new)
         x = np.clip(x, -most, most)
         self.peak = np.maximum(np.abs(x), self.g * self.peak)
         super().hear(x)
@@ -383,8 +385,9 @@ class PowerBudget(Controller):
             WORTHWHILE * np.sum(self.plant.q) / (rho * len(self.rated_power)),
         )
         v, power = system.at(price)
-        # 3 The account must stand it if the last t goes on for twice as long, for every t.
-        share = self.share(j, v, power) if power > 0 else 1.0
+        # 3 The account must stand it, and for longer if a silence has left more than the price follows.
+        saved = CHEAPER * left > 1.0 - CHEAPEST
+        share = self.share(j, v, power, min(level, 1.0) * power if saved else None) if power > 0 else 1.0
         if share < 1.0:
             price, v, _ = system.price_of(share * power, price)
         self.price[j], self.w[j] = price, v
@@ -397,12 +400,18 @@ class PowerBudget(Controller):
         h = [[np.correlate(v[a], v[i], "full")[L - 1 :] for a in range(I)] for i in range(I)]  # sum_m v_a(m + l) v_i(m)
         return sum(2 * h[i][a] @ C[i, a] - h[i][a][0] * C[i, a, 0] for i in range(I) for a in range(I))
 
-    def share(self, j, v, power):
-        """Return the largest share of its power that the account of loudspeaker j stands, for a filter v, (I, L)."""
-        spent, T = np.concatenate([[0.0], np.cumsum(self.book[:, j])]), self.blocks
+    def share(self, j, v, power, now):
+        """Return the largest share of its power that the account of loudspeaker j stands, for a filter v, (I, L).
+
+        It must stand the power of the last block for T/20, that of the window of x for T/4, and that of now, if given, for
+        any time from there to 3T/4: so what a silence has left is spent evenly.
+        """
+        T, rho, window = self.blocks, self.rated_power[j], self.blocks // WINDOW_LASTS
+        spent = np.concatenate([[0.0], np.cumsum(self.book[:, j])])
         y = sum(filtered(h, u, self.B) for h, u in zip(v, self.x_past, strict=True))
-        expected = [(power, T // WINDOW_LASTS), (np.mean(y**2), T // BLOCK_LASTS)]  # power, for how many blocks
-        rho = self.rated_power[j]
+        expected = [(power, window), (np.mean(y**2), T // BLOCK_LASTS)]  # power, for how many blocks
+        if now is not None:
+            expected += [(now, n) for n in range(window + 1, T - window + 1)]
         return min(max(T - spent[T - n], 0.02 * n) / n * rho / max(power, 1e-300) for power, n in expected)
 
 
