@@ -81,3 +81,11 @@ def test_the_bound_is_reached_two_seconds_after(name: str) -> None:
     assert row.loudest_second_db < 0.0
     assert row.loudest_tenth_db < 3.0
     assert row.power < 1.02
+
+
+def test_what_a_silence_has_left_is_spent_evenly() -> None:
+    """It was spent at once: seconds 2 to 4 were 1.5 dB beyond the bound, and the tenth 3.7 dB short of it."""
+    row = study.event_row("soft past, 1e-3")
+    assert max(row.lost_db) < 2.0
+    assert np.mean(row.lost_db[5:]) < 1.0
+    assert row.power < 1.03

@@ -156,6 +156,17 @@ def test_missing_errors_after_silence() -> None:
     compare(oracle, controller, x, d, lambda n: s, on=1501, heard=heard)
 
 
+def test_a_reference_that_sets_in_after_silence() -> None:
+    """It is cut like a click until its peak has grown, and finds an account that is full."""
+    s, x, d, rng = scene(7, 1, 1, 1, 8.0)
+    silent = np.arange(x.shape[1]) < 4.0 * FS
+    x[0, silent] *= 1e-9
+    d[0, silent] = 0.03 * rng.standard_normal(np.sum(silent))
+    oracle, controller = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), 0.3)
+    compare(oracle, controller, x, d, lambda n: s)
+    assert np.mean(oracle.book) > 0.5
+
+
 def test_an_amplifier_model() -> None:
     """The posterior takes what was played."""
     s, x, d, _ = scene(6, 1, 1, 1, 6.0)
