@@ -49,6 +49,8 @@ __all__ = [
 SOUND_PRESSURE = 2e-5  # Pa, the reference of sound pressure levels
 BAND_ORDER, HIGHEST_BAND = 4, 0.48  # of a third octave's filter, and its upper edge over fs: then it keeps to class 1
 
+_SETTLED_DB = 3.0  # from the steady NSE
+
 # Half the main lobe of the four-term Blackman-Harris window, in Fourier bins.
 _LOBE_BINS = 4
 
@@ -301,13 +303,11 @@ def convergence_time_s(
     fs: float,
     *,
     window_s: float = 0.005,
-    tolerance_db: float = 3.0,
-    steady: float = 0.5,
     runs: bool = False,
 ) -> float:
     """Return the first time from which the NSE stays within 3 dB of its steady value.
 
-    The steady value is the NSE of the whole steady portion. From the time returned to the end of the run, the NSE stays
+    The steady value is the NSE of the whole steady half. From the time returned to the end of the run, the NSE stays
     within the tolerance, above and below.
 
     The NSE of a random signal over 5 ms never settles that closely. A band of width B leaves about 2 B window_s
@@ -323,10 +323,6 @@ def convergence_time_s(
         Sampling frequency in Hz.
     window_s : float, default 0.005
         Window of the NSE in seconds.
-    tolerance_db : float, default 3.0
-        Allowed distance from the steady value in dB.
-    steady : float, default 0.5
-        Portion of the run, from its end, that gives the steady value.
     runs : bool, default False
         The leading axis counts runs; squares are summed over them too.
 
@@ -352,11 +348,10 @@ def convergence_time_s(
     0.25
     """
     curve = nse_db(error, disturbance, fs, window_s, runs=runs)
-    steady_value = -noise_reduction_db(error, disturbance, steady=steady, runs=runs)
-    tolerance = as_positive(tolerance_db, "tolerance_db", unit="dB")
+    steady_value = -noise_reduction_db(error, disturbance, runs=runs)
     # A perfect residual is at its steady value, but -inf less -inf is NaN.
     with np.errstate(invalid="ignore"):
-        settled = (np.abs(curve - steady_value) <= tolerance) | (curve == steady_value)
+        settled = (np.abs(curve - steady_value) <= _SETTLED_DB) | (curve == steady_value)
     if not settled[-1]:
         return float("nan")
     outside = np.flatnonzero(~settled)

@@ -187,12 +187,6 @@ def test_density_integrates_to_the_power():
     assert np.sum(10 ** (level / 10)) * (f[1] - f[0]) == pytest.approx(np.mean(x**2), rel=0.02)
 
 
-def test_spectrum_of_silence_and_of_short_signals():
-    assert np.all(power_spectrum_db(np.zeros(4000), FS)[1] == -np.inf)
-    f, level = power_spectrum_db(noise(60), FS)
-    assert f.shape == level.shape == (16,)
-
-
 # ---- short-time power
 
 
@@ -217,7 +211,7 @@ OF_A_SIGNAL = {
 OF_A_PAIR = {
     "nse_db": lambda e, d, **runs: nse_db(e, d, FS, **runs),
     "noise_reduction_db": noise_reduction_db,
-    "convergence_time_s": lambda e, d, **runs: convergence_time_s(e, d, FS, window_s=0.01, tolerance_db=9.0, **runs),
+    "convergence_time_s": lambda e, d, **runs: convergence_time_s(e, d, FS, window_s=0.01, **runs),
     "harmonics_db": lambda e, d, **runs: harmonics_db(e, d, 400.0, FS, **runs),
 }
 

@@ -1,5 +1,4 @@
 from .paths import plot_bode as plot_bode
-from .paths import plot_impulse_responses as plot_impulse_responses
 from .runs import plot_nse as plot_nse
 from .runs import plot_output_power as plot_output_power
 from .runs import save_figure as save_figure

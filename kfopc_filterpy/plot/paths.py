@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._taps import finite_taps, path_taps, sampling_rate
+from .._taps import finite_taps, sampling_rate
 from .._types import PathModel
 from ..paths import analysis
 from . import style
@@ -21,25 +21,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def _named(paths: Any) -> dict[str, Any]:
-    """Return paths by name; a single one is called "path"."""
-    if isinstance(paths, Mapping):
-        if not paths:
-            raise ValueError("paths must name at least one path, got an empty mapping")
-        return dict(paths)
-    return {"path": paths}
-
-
-def _grid(paths: Mapping[str, Any], fs: float | None) -> np.ndarray:
-    """Return 2000 frequencies on a logarithmic scale from 20 Hz to half the lowest sampling rate."""
-    nyquist = min(sampling_rate(path, fs, name=name) for name, path in paths.items()) / 2
-    return np.geomspace(min(20.0, nyquist / 400), 0.999 * nyquist, 2000)
-
-
 def plot_bode(
     paths: PathModel | Mapping[str, PathModel], *, fs: float | None = None, ax: Sequence[Axes] | None = None
 ) -> NDArray[Any]:
-    """Draw the magnitude and phase of paths over frequency in Hz.
+    """Draw the magnitude and phase of paths from 20 Hz to half the lowest sampling rate.
 
     The phase is unwrapped. The delay of each path (its energy onset, stated in the legend of the phase) is removed,
     because its slope would hide everything else; an infinite response keeps its delay. No phase is drawn at frequencies
@@ -75,8 +60,11 @@ def plot_bode(
     ('Magnitude (dB)', 'Frequency (Hz)')
     >>> plt.close(magnitude.figure)
     """
-    named = _named(paths)
-    frequencies = _grid(named, fs)
+    named: dict[str, Any] = dict(paths) if isinstance(paths, Mapping) else {"path": paths}
+    if not named:
+        raise ValueError("paths must name at least one path, got an empty mapping")
+    nyquist = min(sampling_rate(path, fs, name=name) for name, path in named.items()) / 2
+    frequencies = np.geomspace(min(20.0, nyquist / 400), 0.999 * nyquist, 2000)
     magnitude, phase = axes = np.asarray(style.new_axes(ax, rows=2))
     powers = []
     for i, (label, path) in enumerate(named.items()):
@@ -93,45 +81,3 @@ def plot_bode(
     style.frequency_axis(magnitude, frequencies).set_xlabel("")
     style.frequency_axis(phase, frequencies)
     return axes
-
-
-def plot_impulse_responses(
-    paths: PathModel | Mapping[str, PathModel], *, fs: float | None = None, ax: Axes | None = None
-) -> Axes:
-    """Draw the impulse responses of paths over time in ms.
-
-    Parameters
-    ----------
-    paths : path, or mapping of str to path
-        As for `plot_bode`, with finite impulse responses.
-    fs : float, optional
-        Sampling rate in Hz, needed for tap arrays.
-    ax : matplotlib.axes.Axes, optional
-        Axes to draw into, by default new ones.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        The axes drawn into.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As for `path_taps`.
-
-    Examples
-    --------
-    >>> import matplotlib.pyplot as plt
-    >>> from kfopc_filterpy import bandpass_path
-    >>> primary, secondary = bandpass_path(128, fs=16000), bandpass_path(32, fs=16000)
-    >>> ax = plot_impulse_responses({"P": primary, "S": secondary})
-    >>> ax.get_xlabel(), ax.get_legend_handles_labels()[1]
-    ('Time (ms)', ['P', 'S'])
-    >>> plt.close(ax.figure)
-    """
-    ax = style.new_axes(ax)
-    for i, (label, path) in enumerate(_named(paths).items()):
-        taps, rate = path_taps(path, name=label), sampling_rate(path, fs, name=label)
-        ax.plot(1e3 * np.arange(taps.size) / rate, taps, label=label, **style.line_style(i))
-    ax.margins(x=0)
-    return style.labelled(ax, xlabel="Time (ms)", ylabel="Impulse response")

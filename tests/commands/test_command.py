@@ -10,8 +10,6 @@ import sys
 import pytest
 from helpers.commands import FS, ROOT, SCENE, process
 
-from kfopc_filterpy import __version__
-
 
 def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
     ended = process(folder, "verdict", "nose.wav", *SCENE[1:], "--rated-power", "1")
@@ -19,10 +17,6 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
     assert ended.stdout == b""
     assert ended.stderr.startswith(b"kfopc verdict: nose.wav does not exist")
     assert ended.stderr.count(b"\n") == 1
-
-
-def test_the_version_is_printed(command):
-    assert command("--version") == (0, f"kfopc {__version__}\n", "")
 
 
 PATHS = "--primary P.wav --secondary S.wav"
@@ -98,15 +92,6 @@ def test_help_says_what_it_does_and_shows_an_example(command, arguments):
     if arguments != ["paths"]:
         assert "example" in out
         assert f"  kfopc {' '.join(arguments)}".rstrip() in out
-
-
-def test_help_loads_nothing_that_takes_long():
-    """It is there in a fifth of a second; scipy alone takes longer."""
-    show = "import sys; from kfopc_filterpy.commands import main\ntry: main(['--help'])\nfinally: print('scipy' in sys.modules)"
-    shown = subprocess.run(
-        [sys.executable, "-c", show], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True
-    )
-    assert shown.stdout.endswith(b"False\n"), shown.stderr
 
 
 def test_a_reader_that_goes_away_ends_the_command_without_a_word(folder):

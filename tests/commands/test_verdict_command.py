@@ -8,6 +8,7 @@ import shlex
 import sys
 from inspect import signature
 from pathlib import Path
+from unittest.mock import Mock
 
 import jsonschema
 import numpy as np
@@ -175,15 +176,10 @@ def test_a_verdict_notes_a_short_or_clipped_recording_in_terminal_and_json(comma
     ],
 )
 def test_a_path_error_is_the_one_that_is_stated_or_the_default_of_assess(command, monkeypatch, options, expected):
-    asked = {}
-
-    def stop(*signals, **settings):
-        asked.update(settings)
-        raise ValueError("enough")
-
-    monkeypatch.setattr(verdict, "assess", stop)
+    asked = Mock(side_effect=ValueError("enough"))
+    monkeypatch.setattr(verdict, "assess", asked)
     command("verdict", *SCENE, "--rated-power", 1, *options)
-    assert asked["secondary_path_uncertainty"] == expected
+    assert asked.call_args.kwargs["secondary_path_uncertainty"] == expected
     told = " ".join(command("verdict", "--help")[1].split())
     assert f"(default: a relative rms error of {DEFAULT_UNCERTAINTY:g})" in told
 

@@ -86,24 +86,7 @@ def test_a_page_that_loads_something_from_a_network_fails_the_build(tmp_path, lo
         offline.require_offline(app, None)
 
 
-def test_without_mathjax_the_error_names_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "sphinx-mathjax-offline", None)
-    with pytest.raises(ModuleNotFoundError, match=r"sphinx-mathjax-offline; install the extra"):
-        offline.mathjax_file()
-
-
 # The reference.
-
-
-def test_every_public_name_has_a_page_and_a_line_in_the_table():
-    index = public_names.index_page()
-    for name, thing in PUBLIC:
-        page = public_names.name_page(name)
-        kind = "autoclass" if inspect.isclass(thing) else "autofunction"
-        assert f".. {kind}:: kfopc_filterpy.{name}\n" in page
-        assert index.count(f":doc:`{name} <{name}>`") == 1
-        assert f"\n   {name}\n" in index
-    assert "plot.plot_nse" in NAMES
 
 
 def test_every_public_name_has_a_summary_and_an_example_or_is_made_by_one():

@@ -39,19 +39,8 @@ class Native:
 
     def __init__(self, folder, real):
         library, flags = folder / f"{real}.so", [flag for flag in FLAGS if not flag.startswith("-fvisibility")]
-        defined = ["-DANC_FLOAT"] if real == "float" else []
-        command = [
-            *c_compiler(),
-            *flags,
-            "-fPIC",
-            *defined,
-            f"-I{FOLDER}",
-            *map(str, listening.sources()),
-            "-lm",
-            "-o",
-            str(library),
-        ]
-        subprocess.run(command, check=True)
+        flags += ["-fPIC", f"-I{FOLDER}", *(["-DANC_FLOAT"] if real == "float" else [])]
+        subprocess.run([*c_compiler(), *flags, *listening.sources(), "-lm", "-o", library], check=True)
         self.library = ctypes.CDLL(str(library))
         self.real = ctypes.c_float if real == "float" else ctypes.c_double
         self.library.player_buffer.restype = ctypes.POINTER(self.real)

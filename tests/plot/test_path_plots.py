@@ -4,10 +4,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from kfopc_filterpy._taps import path_taps
 from kfopc_filterpy.paths.analysis import frequency_response
 from kfopc_filterpy.paths.models import bandpass_path
-from kfopc_filterpy.plot.paths import plot_bode, plot_impulse_responses
+from kfopc_filterpy.plot.paths import plot_bode
 
 FS = 16000.0
 P, S = bandpass_path(128, fs=FS), bandpass_path(32, fs=FS)
@@ -34,19 +33,6 @@ def test_bode_draws_magnitude_and_phase_in_hz():
     assert _labels(phase)[1] == "S, less 0.81 ms"
     slower = plot_bode({"S": S, "of another rate": bandpass_path(8, (0, 1e3), fs=8e3)})[0]
     assert slower.get_xlim()[1] == pytest.approx(4000, rel=2e-3)
-
-
-def test_impulse_responses_are_in_milliseconds():
-    ax = plot_impulse_responses({"S": S, "Ŝ": path_taps(S)}, fs=FS)
-    assert ax.get_xlabel() == "Time (ms)"
-    np.testing.assert_allclose(ax.get_lines()[0].get_data(), [np.arange(32) / 16, path_taps(S)])
-
-
-def test_given_axes_are_used_and_returned():
-    ax = plt.subplots()[1]
-    assert plot_impulse_responses(S, ax=ax) is ax
-    assert plt.get_fignums() == [ax.figure.number]
-    assert not ax.get_title()
 
 
 @pytest.mark.parametrize(

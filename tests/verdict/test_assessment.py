@@ -8,6 +8,7 @@ import json
 import re
 from dataclasses import replace
 from datetime import date
+from unittest.mock import Mock
 
 import jsonschema
 import numpy as np
@@ -136,28 +137,14 @@ def test_a_tone_is_predicted_so_that_a_late_loudspeaker_does_not_limit():
     assert verdict.enough
 
 
-class Bar:
-    """A progress bar that keeps how far it moved."""
-
-    total: int | None = None
-
-    def __init__(self) -> None:
-        self.moved: list[int] = []
-
-    def update(self, samples: int) -> None:
-        self.moved.append(samples)
-
-    def set_description(self, text: str) -> None:
-        pass
-
-
 def test_the_bar_moves_while_fxlms_is_tuned_and_ends_at_its_total():
-    bar = Bar()
+    bar = Mock(total=None)
     on(algorithm="FxLMS", beside=("KF-PB",), bar=bar, want_db=0.0)
     after_switch_on = round(0.9 * SECONDS * FS)
     grid = len(STEP_SIZES)
-    assert bar.total == sum(bar.moved) == (2 + grid) * after_switch_on
-    assert bar.moved.count(after_switch_on) >= grid
+    moved = [call.args[0] for call in bar.update.call_args_list]
+    assert bar.total == sum(moved) == (2 + grid) * after_switch_on
+    assert moved.count(after_switch_on) >= grid
 
 
 def watts(sine_watt: float) -> AmplifierRating:
