@@ -175,17 +175,12 @@ def table(outcome: Mapping[str, Any]) -> str:
 
 def place(scores: Sequence[Score], name: str = "KF-PB") -> str:
     """Return the place of an entry in a sentence; nothing if it has none."""
-    first, *others = (one for one in scores if not one.failed)
-    own = next((one for one in (first, *others) if one.entry == name), None)
-    if own is None:
+    kept = [one.entry for one in scores if one.within_rating]
+    if name not in kept:
         return ""
-    said = f"{name} has place {scores.index(own) + 1} of {len(scores)}"
-    if own is not first:
-        return f"{said}, {first.noise_reduction_db - own.noise_reduction_db:.2f} dB behind {first.entry}."
-    kept = [one for one in others if one.within_rating]
-    return said + (
-        f", {own.noise_reduction_db - kept[0].noise_reduction_db:.2f} dB ahead of {kept[0].entry}." if kept else "."
-    )
+    k = kept.index(name)
+    behind = scores[0].noise_reduction_db - scores[k].noise_reduction_db
+    return f"{name} has place {k + 1} of {len(scores)}" + (f", {behind:.2f} dB behind {kept[0]}." if k else ".")
 
 
 def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = None) -> int:

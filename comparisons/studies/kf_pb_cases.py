@@ -1,4 +1,4 @@
-"""Plants, noises and faults that KF-PB is judged in, and the fixed filters of each case: for its study and the loss map."""
+"""Plants and noises that KF-PB is judged in, and the fixed filters of each case: for its study and the loss map."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from kfopc_filterpy import Plant, kf_pb, noise_reduction_db, power_constrained_wiener, simulate
-from kfopc_filterpy.paths import path_taps, perturbed_path
 
 from ..bench.noises import level_jump, looped
 from ..bench.scene import reachable_weights
@@ -22,14 +21,6 @@ SILENT_S, DURATION_S = 3.0, 20.0  # before and after the control is switched on
 SHARES = (0.25, 0.1)  # rated power over the power that full control needs
 SEED = 1
 STEADY, CHANGING = "steady and recorded", "jumps, bursts, mixes"
-FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {  # what becomes of the secondary path
-    "two samples late": lambda s: np.concatenate([np.zeros(2), s[:-2]]),
-    "two samples early": lambda s: np.concatenate([s[2:], np.zeros(2)]),
-    "3 dB louder": lambda s: 10**0.15 * s,
-    "3 dB softer": lambda s: 10**-0.15 * s,
-    "polarity": lambda s: -s,
-    "another phase": lambda s: path_taps(perturbed_path(s, fs=FS, phase_deg=120.0))[: s.size],
-}
 JUMPS = {  # dB, from and to s after switch-on
     "12 dB louder from 8 s on": (12.0, 8.0, DURATION_S),
     "12 dB softer from 8 s on": (-12.0, 8.0, DURATION_S),

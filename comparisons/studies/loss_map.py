@@ -13,18 +13,17 @@ from kfopc_filterpy import OutputLimiter, Plant
 from ..bench import FigureItem, Parameter, Runs, StudyReport, Table
 from . import kf_pb_cases as cases
 from .cases import FS, SENSOR_NOISE_DB
-from .kf_pb_cases import FAULTS, STEADY, fixed_filters, make_rated, with_any_power
+from .kf_pb_cases import STEADY, fixed_filters, make_rated, with_any_power
 from .report_parts import new_figure, report_of_rows, without_measured
 from .rows import grouped
 
 LONG = 4 * cases.N_TAPS  # taps that stand for a filter of any length
-FAULT = "two samples early"  # of the estimate that KF-PB gets to verify
 STAGES = {  # what each stage adds to the one before
     "causality": f"a causal filter of {LONG} taps, with any power",
     "length": f"a filter of {cases.N_TAPS} taps",
     "price": "the rated power is kept in every second, and each second has its own filter",
     "adaptation": "KF-PB with the exact path, within the rated power over 10 s",
-    "path": f"KF-PB with an estimate that is {FAULT}, which it verifies",
+    "path": "KF-PB with an estimate that is two samples early, which it verifies",
     "limiter": "the same behind a limiter that keeps the rated power in every 100 ms",
 }
 
@@ -48,7 +47,7 @@ def loss_row(plants: dict[str, Plant], job: tuple[str, str]) -> LossRow:
     """Run every stage of a case."""
     path, noise = job
     case = make_rated(plants[path], cases.noises()[noise][1](), cases.SHARES[0])
-    wrong = FAULTS[FAULT](case.secondary)
+    wrong = np.concatenate([case.secondary[2:], np.zeros(2)])
     controllers = [
         case.kf_pb(case.secondary, secondary_path_uncertainty=None),
         case.kf_pb(wrong),

@@ -28,7 +28,7 @@ def report() -> Iterator[StudyReport]:
         "JUMPS": {"12 dB louder from 3 s on": (12.0, 3.0, 5.0)},
         "all_plants": lambda: {"short": PLANT},
     }
-    with smaller(kf_pb_cases, **SMALL, **own), smaller(study, JUMP_S=2.0, **settings):
+    with smaller(kf_pb_cases, **SMALL, **own), smaller(study, **settings):
         yield run_study(study)
 
 
@@ -41,10 +41,3 @@ def test_a_row_is_what_a_run_of_ones_own_says(report: StudyReport) -> None:
     expected = noise_reduction_db(result.error[late], result.disturbance[late], steady=1.0)
     assert row["noise_reduction_db"] == pytest.approx(expected)
     assert row["noise_reduction_db"] > 3.0
-
-
-def test_every_fault_is_overcome(report: StudyReport) -> None:
-    """From two seconds after the fault on. A softer path needs more power, and a phase of five taps is another path."""
-    for row in report.extra["faults"]:
-        if row["fault"] not in ("3 dB softer", "another phase"):
-            assert row["lost_db"] < 1.0, row
