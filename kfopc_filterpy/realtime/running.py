@@ -82,10 +82,12 @@ class RunStatus:
 
 @dataclass
 class RunReport(RunStatus):
-    """What a run has done: as `RunStatus`, with reduction and powers over the second half, and more.
+    """What a run has done.
 
     Attributes
     ----------
+    seconds, reduction_db, powers, rated_power, load, overruns, lost, underflows, health
+        Of the whole run, as in `RunStatus`; reduction and powers over its second half.
     stopped_by : str
         "end" of the time or of the noise, "user", or the fault that ended it.
     round_trip_samples : int or None

@@ -70,6 +70,7 @@ def test_page_says_everything_and_escapes_it(written):
     text = html.unescape(re.sub(r"<[^>]*>", "", source))
     for said in (
         "Tone & clip <hard>",
+        "A tone <of> 2.",
         "2 of 4 claims hold",
         "✓ holds",
         "✗ fails",

@@ -25,7 +25,7 @@ def study(name: str = "tonal", **changes: Any) -> StudyReport:
     settings: dict[str, Any] = {
         "name": name,
         "title": "Tone & clip <hard>",
-        "summary": "A tone of 2 > 1.",
+        "summary": "A tone <of> 2.",
         "fs": FS,
         "rated_power": 0.8,
         "parameters": {
