@@ -371,6 +371,8 @@ class KFOPC(KalmanFilter, Checkpointed):
         factor = self.constraint_factor
         reference = None if reference is None else as_number(reference, "reference")
         if self._constraint is not None:
+            if np.size(z) != 1:
+                raise ValueError(f"a rated power needs one measurement, got {np.size(z)}; {ONE_CHANNEL}")
             row = np.ravel(self.H if H is None else H)
             self._require_random_walk(self.F)
             self._require_other_row(row)

@@ -60,6 +60,8 @@ def test_the_filter_has_a_constraint_of_its_own_whose_settings_stay() -> None:
 
 
 def test_a_rated_power_is_for_one_measurement() -> None:
+    with pytest.raises(ValueError, match="needs one measurement, got 2; kf_opc takes several"):
+        KFOPC(4, constraint=constraint()).update([1.0, 2.0], H=np.ones((2, 4)), R=np.eye(2))
     for make_one in (lambda: KFOPC(4, 2, constraint=constraint()), lambda: KFOPC(4, 2, rated_power=1.0, fs=FS)):
         with pytest.raises(ValueError, match=r"needs one measurement, dim_z = 1, got dim_z = 2; kf_opc takes several"):
             make_one()
