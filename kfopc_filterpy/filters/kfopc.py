@@ -11,7 +11,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike
 
-from .._validate import as_count, as_finite_array, as_nonnegative, as_number, require_finite
+from .._validate import as_count, as_finite_array, as_number, require_finite
 from ..checkpoint import Checkpointed
 from . import checked_steps
 
@@ -56,7 +56,7 @@ class KFOPC(KalmanFilter, Checkpointed):
        \hat w(n|n) &= \hat w(n|n-1) \\
        &\ + K(n) [\alpha \hat d(n) - x'^T(n) \hat w(n|n-1)]
 
-    With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except that
+    With ``rated_power=None`` it is filterpy's filter bit for bit, except that
     arguments that would corrupt that filter (NaN, Inf, complex numbers, a wrong shape, a negative variance, a P that is
     not positive semidefinite) raise an error before anything changes. The page "What differs from filterpy" lists them.
     `F` and `H` may be nested lists, which are stored as arrays.
@@ -143,7 +143,6 @@ class KFOPC(KalmanFilter, Checkpointed):
     ) -> None:
         self._constraint: Any = None
         self._settings: Any = None  # those of the next constraint: of `fs`, or of the constraint that was lifted
-        self._unconstrained_factor = 1.0
         self._moved = False  # by a control input
         dim_x, dim_z = as_count(dim_x, "dim_x"), as_count(dim_z, "dim_z")
         self._row = np.zeros(dim_x)  # the last H with a rated power,
@@ -287,10 +286,9 @@ class KFOPC(KalmanFilter, Checkpointed):
         missing = None
         if isinstance(z, np.ma.MaskedArray):
             z, R, H, missing = checked_steps.without_masked(self, z, R, H)
-        plain = self._constraint is None and self._unconstrained_factor == 1.0
         if z is None:
             super().update(None)
-        elif plain and reference is None and checked_steps.is_usual_measurement(self, z, R, H):
+        elif self._constraint is None and reference is None and checked_steps.is_usual_measurement(self, z, R, H):
             self._all_or_nothing(super().update, checked_steps.checked_measurement, z, R, H)
         else:
             z, R, H = checked_steps.checked_measurement(self, z, R, H)
@@ -362,13 +360,11 @@ class KFOPC(KalmanFilter, Checkpointed):
             self.z = np.array(self.z).reshape(self.dim_z, 1)
             KalmanFilter.update_sequential(self, start, scaled, R_i, H_i)
 
-        self._scaled_step(update_sequential, z_i, R_i, H_i, H=rows, reference=reference, start=start)
+        self._scaled_step(update_sequential, z_i, R_i, H_i, H=rows, reference=reference)
 
-    def _scaled_step(
-        self, step: Callable[..., None], z: Any, *others: Any, H: Any, reference: Any, start: int | None = None
-    ) -> None:
+    def _scaled_step(self, step: Callable[..., None], z: Any, *others: Any, H: Any, reference: Any) -> None:
         """Run a step on the scaled measurement (eq. 9), then accept its powers; an error leaves the filter unchanged."""
-        factor = self.constraint_factor
+        factor = 1.0
         reference = None if reference is None else as_number(reference, "reference")
         if self._constraint is not None:
             if np.size(z) != 1:
@@ -379,10 +375,7 @@ class KFOPC(KalmanFilter, Checkpointed):
             factor = self._constraint.preview(float(np.asarray(z).item()), row[0], reference)
         self._all_or_nothing(step, None, self._scaled(z, factor), *others)
         if factor != 1.0:  # store z as given, not scaled, in filterpy's shape
-            if start is None:
-                self.z = np.reshape(z, np.shape(self.z)).copy()
-            else:
-                self.z[start : start + np.size(z)] = np.reshape(z, (-1, 1))
+            self.z = np.reshape(z, np.shape(self.z)).copy()
         if self._constraint is not None:
             self._constraint.accept()
             self._note_row(row)
@@ -429,14 +422,11 @@ class KFOPC(KalmanFilter, Checkpointed):
     @property
     def constraint_factor(self) -> float:
         """Factor that scales the measurement; assign a value to fix it, None to follow eq. 13 again."""
-        return self._unconstrained_factor if self._constraint is None else self._constraint.factor
+        return 1.0 if self._constraint is None else self._constraint.factor
 
     @constraint_factor.setter
     def constraint_factor(self, value: float | None) -> None:
-        if self._constraint is not None:
-            self._constraint.factor = value
-        else:
-            self._unconstrained_factor = 1.0 if value is None else as_nonnegative(value, "constraint_factor")
+        self._require_constraint("constraint_factor").factor = value
 
     @property
     def disturbance_power(self) -> float | None:

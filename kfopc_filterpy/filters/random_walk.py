@@ -166,7 +166,7 @@ class RandomWalkKFOPC(KFOPC):
         energy = ddot(h, h)
         if not isfinite(d + energy):
             checked_steps.checked_measurement(self, d, None, h)  # raises unless only the energy overflows
-        factor = self._unconstrained_factor
+        factor = 1.0
         if constraint is not None:  # eq. 10-13
             self._require_other_row(h)
             factor = constraint.preview(d, h[0], reference)

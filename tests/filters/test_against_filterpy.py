@@ -192,8 +192,7 @@ class Twins(RuleBasedStateMachine):
             self.oracle.update(None)
             return
         oracle.dim_z = there.sum()
-        scaled = self.ours.constraint_factor * z[there].reshape((-1, 1)[:x_ndim])
-        oracle.update(scaled, R=oracle.R[np.ix_(there, there)], H=oracle.H[there])
+        oracle.update(z[there].reshape((-1, 1)[:x_ndim]), R=oracle.R[np.ix_(there, there)], H=oracle.H[there])
         for name in ("x", "P", *LIKELIHOODS):
             np.testing.assert_allclose(
                 getattr(self.ours, name), getattr(oracle, name), rtol=1e-10, atol=1e-10, err_msg=name

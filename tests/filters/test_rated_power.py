@@ -75,12 +75,17 @@ def test_the_constraint_factor_is_that_of_the_equation_and_needs_no_reference_if
 
 
 @both_kinds
-def test_a_factor_without_a_rated_power_scales_the_measurement(kind: str) -> None:
-    kf = make(kind)
-    for factor, y in ((0.5, 1.0), (0.0, 0.0), (None, 2.0)):
+def test_a_factor_that_is_fixed_scales_the_measurement(kind: str) -> None:
+    kf = make(kind, rated_power=1.0, fs=FS)
+    for factor, y in ((0.5, 1.0), (0.0, 0.0), (1.0, 2.0)):
         kf.constraint_factor, kf.x = factor, np.zeros((TAPS, 1))
-        kf.update(2.0, H=np.ones((1, TAPS)))
+        kf.update(2.0, H=np.linspace(1.0 - factor, 1.0, TAPS).reshape(1, TAPS))
         assert (kf.y.item(), np.asarray(kf.z).item()) == (y, 2.0)
+    kf.rated_power = None
+    assert kf.constraint_factor == 1.0
+    for name in ("constraint_factor", "disturbance_power", "secondary_path_gain"):
+        with pytest.raises(ValueError, match=f"{name} needs a constraint: set rated_power first"):
+            setattr(kf, name, 1.0)
 
 
 # What a rated power is not for.
