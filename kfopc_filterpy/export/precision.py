@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.block import Algorithm, Block
-from ..core.library import constant
-from ..power.limiter import NUMBERS, spans_of
+from ..power.limiter import NUMBERS
 
 REALS = {np.dtype(np.float64): "double", np.dtype(np.float32): "float"}  # C's names
 LARGEST_MARGIN = 0.01  # of the rated power, which the limiter keeps free for rounding
@@ -70,8 +69,5 @@ def _convert_limiter(numbers: np.ndarray, precision: np.dtype) -> None:
             f"the limiter's window of {window} samples is too long for {precision}, whose rounding errors would take "
             f"{100 * margin:.1f} % of the rated power: at most {longest} samples, or dtype='float64'"
         )
-    spans = int(numbers["spans"][0])
     numbers["peak"] = (1.0 - 4.0 * epsilon) / numbers["scale"]
     numbers["budget"] = 1.0 - margin
-    for values in (numbers["average"], numbers["loud"], spans_of(numbers)[1:, :spans]):  # held and room
-        np.maximum(values, constant("limiter_floor", "float"), out=values)
