@@ -170,6 +170,20 @@ def require_control(kf: KalmanFilter, u: ArrayLike | None, B: ArrayLike | None) 
             as_finite_array(value, name)
 
 
+def with_masks(z: Any) -> Any:
+    """Return a measurement that has None among its components, as a table with gaps gives it, as a masked array."""
+    has_objects = (
+        z.dtype.kind == "O"
+        if isinstance(z, np.ndarray)
+        else isinstance(z, list | tuple) and any(one is None for one in z)
+    )
+    if not has_objects:
+        return z
+    values = np.asarray(z, dtype=object)
+    missing = np.reshape([one is None for one in values.flat], values.shape)
+    return np.ma.masked_array(as_real_array(np.where(missing, 0.0, values), "z"), missing)
+
+
 def without_masked(kf: KalmanFilter, z: np.ma.MaskedArray, R: Any, H: Any) -> tuple[Any, Any, Any, np.ndarray | None]:
     """Return z, R and H with which filterpy corrects by the components of z that are not masked, and which are masked.
 

@@ -253,7 +253,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         ----------
         z : float, array_like or None
             Measurement, (dim_z, 1) or what converts to it. None is a missed sample: nothing is corrected and
-            no power estimate advances. Masked components of a masked array are missing: the state is corrected by
+            no power estimate advances. Masked components of a masked array, and None among others, are missing: the state is corrected by
             the others, with their rows of H and R. `z` is NaN there, `y` and the column of `K` are 0, and the likelihoods
             are those of the others. All masked is None.
         R : float or array_like, optional
@@ -283,7 +283,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         >>> kf.x.ravel(), kf.z.ravel()
         (array([2., 0.]), array([ 4., nan]))
         """
-        missing = None
+        missing, z = None, checked_steps.with_masks(z)
         if isinstance(z, np.ma.MaskedArray):
             z, R, H, missing = checked_steps.without_masked(self, z, R, H)
         if z is None:
@@ -491,7 +491,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         Parameters
         ----------
         zs : sequence or numpy.ma.MaskedArray
-            As in filterpy: a sample of None is missing. So are masked components, as in `update`.
+            As in filterpy: a sample of None is missing. So are masked components, and None among others, as in `update`.
         Fs, Qs, Hs, Rs, Bs, us, update_first, saver
             As in filterpy; each step of `Hs` may be (n,).
         references : array_like, optional

@@ -87,6 +87,20 @@ def test_the_smoother_takes_gaps() -> None:
     np.testing.assert_allclose(P[2], np.linalg.inv(A.T @ A)[4:6, 4:6], rtol=1e-9)
 
 
+def test_a_table_with_none_in_its_gaps_is_one_with_masks() -> None:
+    """As pandas gives it with ``df.replace(nan, None)``; a row of None is a missed sample."""
+    table = np.array([[1.0, 2.0], [None, None], [3.0, None], [4.0, 5.0]], dtype=object)
+    masked = np.ma.masked_invalid(table.astype(float))
+    results = []
+    for zs in (masked, table, table.tolist()):
+        kf = KFOPC(dim_x=2, dim_z=2)
+        kf.H = np.eye(2)
+        results.append(kf.batch_filter(zs))
+    for one in results[1:]:
+        for found, expected in zip(one, results[0], strict=True):
+            np.testing.assert_array_equal(found, expected)
+
+
 def test_it_is_a_filterpy_filter_with_its_signature_and_its_repr() -> None:
     assert issubclass(KFOPC, KalmanFilter)
     kf = KFOPC(4, 2, 1)
