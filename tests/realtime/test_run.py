@@ -202,9 +202,12 @@ def watched(blocks: int, **settings: Any) -> tuple[Any, np.ndarray, np.ndarray, 
     return report, powers[2:], played[2:], np.mean(powers[:2])
 
 
-@pytest.mark.parametrize(("blocks", "begin"), [(1, 0), (3, 2), (4, 2), (101, 50), (4095, 2048)])
-def test_the_report_is_of_the_second_half_of_a_run_of_any_length(blocks: int, begin: int) -> None:
-    """The half is one of seconds, joined in runs beyond 2048 s."""
+@pytest.mark.parametrize(("blocks", "begin", "parts"), [(1, 0, 8), (3, 2, 8), (4, 2, 8), (101, 50, 2048), (101, 48, 8)])
+def test_the_report_is_of_the_second_half_of_a_run_of_any_length(
+    blocks: int, begin: int, parts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The half is one of seconds, or of 2, 4, 8 s that are joined where there would be too many parts."""
+    monkeypatch.setattr(running, "MOST_PARTS", parts)
     report, errors, played, before = watched(blocks)
     assert report.seconds == blocks / 2
     np.testing.assert_allclose(report.powers, np.mean(played[begin:]), rtol=1e-12)
@@ -214,13 +217,14 @@ def test_the_report_is_of_the_second_half_of_a_run_of_any_length(blocks: int, be
 def test_a_report_has_the_levels_since_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """And the share of a block of half a second that its processing took."""
     reports: list[RunStatus] = []
-    monkeypatch.setattr(running.time, "perf_counter", itertools.count(step=0.2).__next__)
+    times = itertools.chain([0.0, 0.3], itertools.count(1.0, 0.2))  # before and after each block
+    monkeypatch.setattr(running.time, "perf_counter", times.__next__)
     _, errors, played, before = watched(6, report_every_s=1.0, on_report=reports.append)
     assert [status.seconds for status in reports] == [1.0, 2.0, 3.0]
     error, output = (np.mean(powers.reshape(3, 2), axis=1) for powers in (errors, played))
     np.testing.assert_allclose([status.powers[0] for status in reports], output)
     np.testing.assert_allclose([status.reduction_db[0] for status in reports], 10 * np.log10(before / error))
-    assert [status.load for status in reports] == pytest.approx([0.4] * 3)
+    assert [status.load for status in reports] == pytest.approx([0.6, 0.4, 0.4])
     assert reports[0].rated_power == [0.5]
 
 
