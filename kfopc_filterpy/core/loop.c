@@ -21,24 +21,23 @@ void anc_hear(anc_plant *p, const anc_signals *s, int64_t n)
     }
 }
 
-/* Move the delay lines on, and put what the amplifiers give into them. */
-static void take_output(anc_plant *p, const anc_signals *s, int64_t n)
+/* Make room for one more sample in every delay line. */
+static void advance(anc_plant *p)
 {
     const int32_t longest = p->path_taps > p->feedback_taps ? p->path_taps : p->feedback_taps;
-    const int full = p->at == 0;
-    p->at = full ? p->length - longest : p->at - 1;
-    for (int32_t sj = 0; sj < p->scenarios * p->loudspeakers; sj++) {
-        real *row = played(p, sj);
-        if (full) copy(row + 1, p->output + times(sj, p->length), (size_t)(longest - 1));
-        *row = s->amplifier_output[sj * s->length + n];
-    }
+    if (--p->at >= 0) return;
+    p->at = p->length - longest;
+    for (int32_t sj = 0; sj < p->scenarios * p->loudspeakers; sj++)
+        copy(played(p, sj) + 1, p->output + times(sj, p->length), (size_t)(longest - 1));
 }
 
 /* One sample of `anc_play`. */
 static void play(anc_plant *p, const anc_signals *s, int64_t n)
 {
     const int32_t J = p->loudspeakers;
-    take_output(p, s, n);
+    advance(p);
+    for (int32_t sj = 0; sj < p->scenarios * J; sj++)
+        *played(p, sj) = s->amplifier_output[sj * s->length + n];
     for (int32_t sk = 0; sk < p->scenarios * p->microphones; sk++) {
         const int64_t at = sk * s->length + n;
         const real *output = played(p, sk / p->microphones * J);

@@ -96,7 +96,7 @@ int main(int argc, char **argv)
         anc_real settings[8 * (MOST + 1)], *value = settings;
         const int few = plan.scenarios <= MOST && plan.loudspeakers <= MOST && plan.microphones <= MOST;
         for (int s = 0; few && a->settings[s].name; s++)
-            for (int32_t n = 0; n < numbers(a->settings + s, &plan); n++) *value++ = tidy ? algorithms[number].settings[s] : any();
+            for (int32_t n = 0; n < numbers(a->settings + s, &plan); n++) *value++ = tidy ? algorithms[number].settings[0][s] : any();
         plan.settings = few ? settings : NULL; /* the size may depend on them */
         const size_t bytes = anc_size(a, &plan);
         if (!bytes || bytes > 1 << 22 || !few) continue; /* refused, or as large as a test should be */

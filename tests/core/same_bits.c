@@ -75,13 +75,30 @@ static int update(void *self, const anc_real *e) { return ((controller *)self)->
 
 static anc_real signal[4 * MOST][SAMPLES], reference[MOST][SAMPLES], disturbance[MOST][SAMPLES];
 
-/* Run an algorithm of a shape; `equipped` with a guard, limiters, amplifiers, windows and computed factors. */
-static void run(int32_t number, int32_t K, int32_t J, int32_t I, int equipped)
+enum { PLAIN, EQUIPPED, HARD };
+
+/* Make the input hard: tones, which excite few directions, first softly, with silence between; and a click. */
+static void harden(int32_t K, int32_t I)
 {
+    static const anc_real period[8] = {1, 0.75f, 0, -0.75f, -1, -0.75f, 0, 0.75f};
+    const anc_real click = sizeof click == sizeof(float) ? 4096.0f : 1e30f;
+    for (int32_t n = 0; n < SAMPLES; n++) {
+        const anc_real level = n < 64 ? 0x1p-20f : n < 300 || n >= 350 ? 1 : 0;
+        for (int32_t i = 0; i < I; i++) reference[i][n] = level * period[(n + i) % 8];
+        for (int32_t k = 0; k < K; k++) disturbance[k][n] = level * period[(n + 3 * k) % 8] + (n == 400 ? click : 0);
+    }
+}
+
+/* Run an algorithm of a shape: plain; equipped with a guard, limiters, amplifiers, windows and computed factors; or on hard
+ * input. */
+static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
+{
+    static const char *const kinds[] = {"plain", "equipped", "hard"};
+    const int equipped = kind == EQUIPPED;
     static anc_real estimated[MOST * MOST * PATH], path[MOST * MOST * PATH], feedback[MOST * MOST * PATH], guard[GUARD], settings[8 * MOST];
     static anc_real output[MOST * (4 * PATH + 64)], present[3 * MOST];
     const int32_t windows[MOST] = {WINDOW, WINDOW, WINDOW}, power_windows[MOST] = {WINDOW, 0, WINDOW / 2};
-    const anc_real limit[MOST] = {1e6f, 1e6f, 1e6f};
+    const anc_real far = kind == HARD ? 1e35f : 1e6f, limit[MOST] = {far, far, far};
     const anc_amplifier amplifiers[MOST] = {{ANC_SOFT_SATURATION, 0.5f, 1.75f}, {ANC_HARD_CLIP, 0.5f, 1}, {ANC_LINEAR, 1, 1}};
     controller c = {.algorithm = algorithms[number].algorithm};
     const anc_plan plan = {.scenarios = 1, .microphones = K, .loudspeakers = J, .references = I, .taps = TAPS, .path_taps = PATH,
@@ -98,7 +115,7 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int equipped)
 
     random_state = 1;
     for (int i = 0; c.algorithm->settings[i].name; i++)
-        for (int32_t n = 0; n < numbers(c.algorithm->settings + i, &plan); n++) *value++ = algorithms[number].settings[i];
+        for (int32_t n = 0; n < numbers(c.algorithm->settings + i, &plan); n++) *value++ = algorithms[number].settings[kind][i];
     for (int32_t n = 0; n < K * J * PATH; n++, size = n % PATH ? size * 0.75f : 0.5f) {
         path[n] = n % PATH < 2 ? 0 : size * noise();
         estimated[n] = path[n] + size * noise() / 16;
@@ -109,9 +126,10 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int equipped)
         for (int32_t i = 0; i < I; i++) reference[i][n] = noise();
         for (int32_t k = 0; k < K; k++) disturbance[k][n] = (n < 6 ? 0 : reference[k % I][n - 6]) + noise() / 32;
     }
+    if (kind == HARD) harden(K, I);
     memset(signal, 0, sizeof signal), memset(output, 0, sizeof output), memset(present, 0, sizeof present);
 
-    printf("%s %s %d %d %d ", algorithms[number].name + 4, equipped ? "equipped" : "plain", (int)K, (int)J, (int)I);
+    printf("%s %s %d %d %d ", algorithms[number].name + 4, kinds[kind], (int)K, (int)J, (int)I);
     const size_t bytes = anc_size(c.algorithm, &plan);
     void *room = malloc(bytes + 64), *block = (char *)room + (64 - (uintptr_t)room % 64) % 64;
     if (!bytes || !room || !anc_open(c.algorithm, &plan, &c.view, block, bytes, 1)) {
@@ -138,9 +156,9 @@ int main(int argc, char **argv)
 #endif
     (void)argc, (void)argv;
     for (int32_t number = 0; algorithms[number].name; number++)
-        for (int equipped = 0; equipped < 2; equipped++) {
-            run(number, 1, 1, 1, equipped);
-            run(number, 2, 3, 2, equipped);
+        for (int kind = PLAIN; kind <= HARD; kind++) {
+            run(number, 1, 1, 1, kind);
+            run(number, 2, 3, 2, kind);
         }
     return 0;
 }

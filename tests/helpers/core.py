@@ -40,6 +40,18 @@ ALGORITHMS: dict[str, Mapping[str, float]] = {
     },
     "signals_alone": {},
 }
+# What differs with everything that a block may have, and on hard input, so that the bits of each branch are recorded.
+EQUIPPED: dict[str, Mapping[str, float]] = {
+    "fxnlms": {"regularization": 0.0},
+    "mov": {"modified": 0.0},
+    "mov_fixed": {"modified": 1.0},
+    "kalman": {"fading": 1 + 2.0**-7},
+}
+HARD: dict[str, Mapping[str, float]] = {
+    "fxnlms": {"regularization": 0.0},
+    "kalman": {"state_noise": 0.0, "measurement_noise": 0.0, "initial_variance": 2.0**10, "fading": 1 + 2.0**-3},
+    "diagonal": {"state_noise": 0.0, "measurement_noise": 0.0, "initial_variance": 2.0**10},
+}
 
 
 def exported(kind: str = "algorithm") -> list[str]:
@@ -100,11 +112,15 @@ def program(
     name: str, folder: Path, command: list[str], *options: str, sources: list[Path] | None = None, **of_flags: str
 ) -> Path:
     """Compile a program of tests/core with the sources of the core, or against a library, and return its path."""
+
+    def numbers(settings: Mapping[str, float]) -> str:
+        return ", ".join(f"(anc_real){value!r}" for value in settings.values())
+
     rows = ", ".join(
-        f"{{ALGORITHM({algorithm}), {{{', '.join(f'(anc_real){value!r}' for value in settings.values())}}}}}"
-        for algorithm, settings in ALGORITHMS.items()
+        f"{{ALGORITHM({name}), {{{', '.join(f'{{{numbers({**plain, **own.get(name, {})})}}}' for own in ({}, EQUIPPED, HARD))}}}}}"
+        for name, plain in ALGORITHMS.items()
     )
-    table = "static struct { const char *name; const anc_algorithm *algorithm; anc_real settings[8]; } algorithms[]"
+    table = "static struct { const char *name; const anc_algorithm *algorithm; anc_real settings[3][8]; } algorithms[]"
     (folder / "algorithms.h").write_text(f"{table} = {{{rows}, {{0}}}};\n")
     made = folder / name
     files = building.core_sources() if sources is None else sources

@@ -1,31 +1,49 @@
-/* A controller of one channel, from anc_open on: RUN samples of any reference and any error. */
+/* A controller, from anc_open on, for ever: any reference and any error, whether it controls or only listens, adapts
+ * or not. */
 #include "signals.h"
 #include "any.h"
-#include "shape.h" /* ALGORITHM, SETTINGS, WINDOW of the powers, RUN, CHANNELS */
+#include "shape.h" /* ALGORITHM and its SETTINGS, and how many there are of what a plan has */
 
-enum { MOST = 8192, TAPS = 2 };
+enum { MOST = 32768, REFERENCES = CHANNELS * (1 + MODELLED), ALL = SCENARIOS * CHANNELS };
 static double block[MOST];
 static anc_view view;
 
+static void any_numbers(anc_real *to, int n)
+{
+    for (int i = 0; i < n; i++) to[i] = any();
+}
+
 int main(void)
 {
-    static const int32_t windows[] = {WINDOW, WINDOW};
-    static const anc_real path[TAPS * CHANNELS * CHANNELS] = {0.5, 0.25}, settings[] = {SETTINGS};
-    const anc_plan plan = {.scenarios = 1,
+    static const int32_t windows[ALL] = {WINDOW}, limiters[] = {LIMITER, LIMITER, LIMITER, LIMITER};
+    static const anc_real path[TAPS * CHANNELS * CHANNELS] = {0.5, 0.25}, guard[GUARD] = {0.1};
+    static const anc_real settings[] = {SETTINGS};
+    const anc_plan plan = {.scenarios = SCENARIOS,
                            .microphones = CHANNELS,
                            .loudspeakers = CHANNELS,
-                           .references = CHANNELS,
+                           .references = REFERENCES,
                            .taps = TAPS,
                            .path_taps = TAPS,
+                           .guard_taps = GUARD,
+                           .modelled = MODELLED,
                            .power_windows = windows,
+                           .limiter_windows = limiters,
                            .path = path,
+                           .guard = guard,
                            .settings = settings};
     if (!anc_open(&ALGORITHM, &plan, &view, block, sizeof block, 1)) return 1;
-    for (int n = 0; n < RUN; n++) {
-        anc_real x[CHANNELS], e[CHANNELS], y[CHANNELS];
-        for (int i = 0; i < CHANNELS; i++) x[i] = any();
-        for (int i = 0; i < CHANNELS; i++) e[i] = any();
-        if (!ALGORITHM.control_signal(&view, x, y)) ALGORITHM.update(&view, e);
+    ((signals *)&view)->amplifier[0] = (anc_amplifier){ANC_SOFT_SATURATION, 1, 2};
+    for (;;) {
+        anc_real x[CHANNELS], e[ALL], y[ALL];
+        any_numbers(x, CHANNELS);
+        any_numbers(e, ALL);
+        if (Frama_C_interval(0, 1)) {
+            const uint8_t adapt = Frama_C_interval(0, 1);
+            int32_t answer;
+            anc_listen(&ALGORITHM, &view, x, e, &adapt, 1, &answer);
+        } else if (!ALGORITHM.control_signal(&view, x, y)) {
+            if (Frama_C_interval(0, 1)) anc_take_error(&view, e);
+            ALGORITHM.update(&view, Frama_C_interval(0, 1) ? e : NULL);
+        }
     }
-    return 0;
 }
