@@ -59,6 +59,7 @@ def test_what_is_taken():
         (as_channels, [[0.0, 1.0], [np.inf, 0.0]], ValueError, r"first at index \(1, 0\)"),
         (as_number, None, TypeError, "x must be a single number, got None"),
         (as_number, [1.0, 2.0], TypeError, "x must be a single number"),
+        (as_number, True, TypeError, "x must be a single number, got True"),
         (as_number, 1j, TypeError, "x must be a single number"),
         (as_number, np.inf, ValueError, "x must be finite, got inf"),
         (as_number, MASKED[1], ValueError, "x must be finite, got a masked value"),
@@ -67,6 +68,7 @@ def test_what_is_taken():
         (as_rate, 9e-4, ValueError, "x must be a sampling rate from 0.001"),
         (as_count, 0, ValueError, "x must be at least 1, got 0"),
         (as_count, 1.0, TypeError, "x must be a whole number"),
+        (as_count, True, TypeError, "x must be a whole number, got True"),
         (partial(as_choice, choices=("a", "b")), "c", ValueError, "x must be one of 'a', 'b', got 'c'"),
         (lambda value, name: per_loudspeaker(value, 3, name), [1.0, 2.0], ValueError, "each of the 3 loudspeakers"),
         (lambda value, name: per_loudspeaker(value, 2, name), [1.0, 0.0], ValueError, "x must be greater than 0"),
@@ -80,7 +82,7 @@ def test_what_is_taken():
         (lambda value, name: as_sample_count(1.0, value, name), 0, ValueError, "fs must be greater than 0 Hz"),
         (lambda value, _: as_generator(value), None, TypeError, "rng must be a seed or a numpy.random.Generator"),
     ],
-    ids=range(35),
+    ids=range(37),
 )
 def test_what_is_refused(check, value, error, message):
     with pytest.raises(error, match=message):

@@ -171,13 +171,12 @@ class CommandController(PlaysBlocks):
         return True
 
     def _failure(self, what: str) -> EntryFailed:
-        """Return why the command failed; its output has ended, so it has ended or soon will."""
+        """Return why the command failed; its output has ended, and so it has, or the time of the run ends it."""
+        status = self._process.wait()
         if self._timed_out:
             return EntryFailed(f"took longer than {self._timeout_s:g} s for a run")
-        try:
-            status = f"ended with status {self._process.wait(timeout=5.0)}"
-        except subprocess.TimeoutExpired:
-            status = "closed its output"
         self._complaints.seek(max(self._complaints.seek(0, os.SEEK_END) - MOST_SAID, 0))
         lines = self._complaints.read().decode(errors="replace").strip().splitlines()
-        return EntryFailed(f"{what} in block {self._blocks} and {status}" + (f": {lines[-1]}" if lines else ""))
+        return EntryFailed(
+            f"{what} in block {self._blocks} and ended with status {status}" + (f": {lines[-1]}" if lines else "")
+        )

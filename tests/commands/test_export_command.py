@@ -140,6 +140,7 @@ WRONG = {
     "bad setting": (GOOD | {"step_size": -1.0}, "", "c.toml: step_size must be greater than 0, got -1"),
     "missing setting": ({"algorithm": "FxLMS", "n_taps": 8}, "", "c.toml: .*missing.*'secondary'"),
     "no TOML": ({}, "algorithm: FxLMS", "c.toml is not TOML: "),
+    "no path": (GOOD | {"secondary": []}, "", "secondary must be taps or names of files, got an empty list"),
     "missing file": (GOOD | {"secondary": "none.wav"}, "", "none.wav"),
     "two budgets": (RATED_TWICE, "[constraint]\nrated_power = 1.0", "give either rated_power= or constraint="),
 }

@@ -18,7 +18,7 @@ from helpers.results import single_result
 from comparisons.bench import Algorithm, Runs, algorithms, make_controller
 from comparisons.bench.registry import registered
 from comparisons.benchmark import study, tasks
-from comparisons.benchmark.blocks import CommandController, EntryFailed
+from comparisons.benchmark.blocks import MOST_SAID, CommandController, EntryFailed
 from comparisons.benchmark.entries import peers, rivals
 from comparisons.benchmark.tasks import FOLDER, LeftOut, Task, read_task
 from kfopc_filterpy import fx_nlms
@@ -263,6 +263,16 @@ def test_a_command_that_has_ended_before_its_first_block_says_why(short: Task, t
     says = "answered 0 of 128 bytes in block 0 and ended with status 1: no licence"
     with pytest.raises(EntryFailed, match=says), entry:
         short.run(entry)
+
+
+def test_of_what_a_command_complains_the_end_is_told(short: Task, tmp_path: Path) -> None:
+    text = "import sys\nraise SystemExit('x' * 1_000_000 + ' the end')"
+    with (
+        pytest.raises(EntryFailed, match="x the end") as told,
+        CommandController(short, command(tmp_path, text)) as entry,
+    ):
+        short.run(entry)
+    assert MOST_SAID < len(str(told.value)) < MOST_SAID + 200
 
 
 def write_for_ever(descriptor: int) -> None:

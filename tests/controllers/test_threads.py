@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kfopc_filterpy import LimitedController, OutputLimiter, Plant, fx_lms, kf_anc, simulate
+from kfopc_filterpy import HardClipAmplifier, LimitedController, OutputLimiter, Plant, fx_lms, kf_anc, simulate
 from kfopc_filterpy.checkpoint import content_of
 from kfopc_filterpy.controllers import FeedbackNeutralizer, core_controller
+from kfopc_filterpy.power import amplifiers, limiter
 
 FS = 8000.0
 S = np.array([0.0, 0.8, -0.3])
@@ -114,3 +115,28 @@ def test_the_interpreter_lock_is_released() -> None:
         if half_done:
             return
     pytest.fail("no block was seen half done")
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "act"),
+    [
+        (limiter, "limit_all", lambda signal: OutputLimiter(1.0, fs=FS).process(signal)),
+        (amplifiers, "amplify_all", HardClipAmplifier(1.0)),
+    ],
+)
+def test_a_long_signal_is_given_to_compiled_code_in_parts(
+    module: Any, name: str, act: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the parts, other threads run and Ctrl-C is heard, which here comes in the second one."""
+    parts, compiled = [], getattr(module, name)
+
+    def interrupted(*arguments: Any) -> None:
+        compiled(*arguments)
+        parts.append(arguments[-1])
+        if len(parts) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, name, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        act(np.ones(5 * core_controller.LONGEST_CALL))
+    assert parts == 2 * [core_controller.LONGEST_CALL]

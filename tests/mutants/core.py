@@ -1,7 +1,8 @@
 """Change a file of the C core at random places, and print the changes that its tests miss: core.py lms.c [40].
 
 Operators, constants, indices and statements change, one at a time, in a copy of the checkout with one library, the baseline
-in double. Changes that are known to make no difference are in `core_survivors.txt`, with their reasons.
+in double. The recorded bits are compared first; with `no-bits` after the number, the tests alone have to notice. Changes
+that are known to make no difference are in `core_survivors.txt`, with their reasons.
 """
 
 from __future__ import annotations
@@ -18,23 +19,21 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from helpers.core import program
+
 ROOT = Path(__file__).resolve().parents[2]
-BITS = "tests/core/test_same_bits.py::test_libraries_of_all_levels[baseline-double]"
 CONTROLLERS = ("tests/controllers/test_against_oracles.py", "tests/controllers/test_little_excitation.py")
 TESTS = {
-    "lms.c": (BITS, *CONTROLLERS, "tests/controllers/test_lms_family.py"),
-    "covariance.c": (
-        BITS,
-        *CONTROLLERS,
-        "tests/controllers/test_kalman_variants.py",
-        "tests/filters/test_random_walk.py",
-    ),
+    "lms.c": ("tests/controllers/test_lms_family.py", *CONTROLLERS),
+    "covariance.c": ("tests/controllers/test_kalman_variants.py", "tests/filters/test_random_walk.py", *CONTROLLERS),
     "limiter.c": (
         "tests/core/test_core_refusals.py",
         "tests/power/test_limiter.py",
         "tests/realtime/test_limiter_promise.py",
-        BITS,
     ),
+    "constraint.c": ("tests/power/test_constraint.py", "tests/controllers/test_against_oracles.py"),
+    "diagonal.c": ("tests/controllers/test_kalman_variants.py", *CONTROLLERS),
 }
 CHANGES: tuple[tuple[str, Any], ...] = (  # what a line may have, and what it becomes
     *((rf" {re.escape(old)} ", f" {new} ") for old, new in ("+-", "-+", "*/", "/*", "<>", "><")),
@@ -75,7 +74,9 @@ def build(tree: Path, objects: Path, name: str) -> bool:
     assert spec.loader is not None
     building = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(building)
-    flags = [flag for flag in building.flags(["gcc"]) if flag != "-shared"]
+    flags = [flag for flag in building.flags(["gcc"]) if flag != "-shared"] + [
+        "-O1"
+    ]  # compiled sooner, to the same bits
     for path in building.core_sources(core):
         made = objects / f"{path.stem}.o"
         current = made.exists() and path.name not in (name, "stamp.c")
@@ -89,18 +90,24 @@ def build(tree: Path, objects: Path, name: str) -> bool:
     return not subprocess.run(["gcc", "-shared", *sorted(objects.glob("*.o")), "-lm", "-o", library]).returncode
 
 
-def survives(tree: Path, tests: tuple[str, ...]) -> bool:
-    """Return whether all tests pass."""
-    command = f"ulimit -t {MOST_CPU_S}; exec {sys.executable} -m pytest -x -q -n0 -p no:cacheprovider "
+def run(tree: Path, command: str) -> subprocess.CompletedProcess[str]:
+    """Run a command with the copy's package."""
     environment = os.environ | {"KFOPC_CORE_LEVEL": "baseline", "PYTHONPATH": str(tree)}
-    for test in tests:  # the quickest first
-        done = subprocess.run(["sh", "-c", command + f"'{test}'"], cwd=tree, env=environment, capture_output=True)
-        if done.returncode:
-            return False
-    return True
+    limited = f"ulimit -t {MOST_CPU_S}; exec {command}"
+    return subprocess.run(["sh", "-c", limited], cwd=tree, env=environment, capture_output=True, text=True)
 
 
-def main(name: str, count: str = "40") -> int:
+def survives(tree: Path, tests: tuple[str, ...], bits: Path | None) -> bool:
+    """Return whether a program prints the recorded bits, if there is one, and all tests pass."""
+    recorded = (tree / "tests" / "core" / "same_bits.txt").read_text().splitlines()
+    expected = [line.removeprefix("double ") for line in recorded if line.startswith("double ")]
+    if bits and run(tree, str(bits)).stdout.splitlines() != expected:
+        return False
+    command = f"{sys.executable} -m pytest -x -q -n0 -p no:cacheprovider"
+    return not any(run(tree, f"{command} '{test}'").returncode for test in tests)  # the quickest first
+
+
+def main(name: str, count: str = "40", *no_bits: str) -> int:
     """Print the mutants of a file that survive and are not known to; return 1 if there are any."""
     source = (ROOT / "kfopc_filterpy" / "core" / name).read_text()
     lines = source.splitlines()
@@ -112,11 +119,14 @@ def main(name: str, count: str = "40") -> int:
         shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(".git", ".nox", ".venv", "docs", "libanc-*"))
         objects.mkdir()
         assert build(tree, objects, name)
-        assert survives(tree, TESTS[name]), "the tests fail without a change"
+        core = tree / "kfopc_filterpy" / "core"
+        library = core / "libanc-double-baseline.so"
+        bits = None if no_bits else program("same_bits", Path(folder), ["gcc"], f"-Wl,-rpath,{core}", sources=[library])
+        assert survives(tree, TESTS[name], bits), "the tests fail without a change"
         for number, line in sorted(chosen):
             changed = [*lines[:number], line, *lines[number + 1 :]]
-            (tree / "kfopc_filterpy" / "core" / name).write_text("\n".join(changed) + "\n")
-            if build(tree, objects, name) and survives(tree, TESTS[name]):
+            (core / name).write_text("\n".join(changed) + "\n")
+            if build(tree, objects, name) and survives(tree, TESTS[name], bits):
                 expected = f"{name}: {lines[number].strip()} -> {line.strip()}" in known
                 left += not expected
                 print(
