@@ -1,5 +1,6 @@
-/* Runs every algorithm in the loop on fixed noise and prints a hash of the signals and one of the blocks' states. The output
- * must be the same for every compiler, flag, processor and system: see test_same_bits.py, which also writes algorithms.h. */
+/* Runs every algorithm in the loop on fixed noise and prints a hash of the signals and one of the
+ * blocks' states. The output must be the same for every compiler, flag, processor and system: see
+ * test_same_bits.py, which also writes algorithms.h. */
 #include "random.h"
 #include "algorithms.h"
 #include <inttypes.h>
@@ -8,14 +9,26 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { TAPS = 21, PATH = 13, GUARD = 5, SAMPLES = 700, WINDOW = 50, MOST = 3 }; /* no multiples of 8 */
+enum {
+    TAPS = 21,
+    PATH = 13,
+    GUARD = 5,
+    SAMPLES = 700,
+    WINDOW = 50,
+    MOST = 3
+}; /* no multiples of 8 */
 
-typedef struct { uint64_t value; const char *block; } hash;
+typedef struct {
+    uint64_t value;
+    const char *block;
+} hash;
 
-/* Take the bits of a number, the lowest byte first (FNV-1a). NaN is one value: its sign differs between processors. */
+/* Take the bits of a number, the lowest byte first (FNV-1a). NaN is one value: its sign differs
+ * between processors. */
 static void take(hash *h, uint64_t bits, size_t bytes)
 {
-    for (size_t b = 0; b < bytes; b++) h->value = (h->value ^ (bits >> 8 * b & 255)) * 1099511628211u;
+    for (size_t b = 0; b < bytes; b++)
+        h->value = (h->value ^ (bits >> 8 * b & 255)) * 1099511628211u;
 }
 
 static void take_real(hash *h, anc_real number)
@@ -29,7 +42,8 @@ static void take_real(hash *h, anc_real number)
     take(h, bits, sizeof bits);
 }
 
-static void take_field(void *to, const char *name, anc_role role, anc_type type, size_t offset, const int32_t shape[4])
+static void take_field(void *to, const char *name, anc_role role, anc_type type, size_t offset,
+                       const int32_t shape[4])
 {
     hash *h = to;
     const char *field = h->block + offset;
@@ -38,29 +52,47 @@ static void take_field(void *to, const char *name, anc_role role, anc_type type,
     for (size_t i = 0; role != ANC_SCRATCH && i < n; i++) {
         anc_real number;
         int32_t count;
-        if (type == ANC_IS_REAL) memcpy(&number, field + i * sizeof number, sizeof number), take_real(h, number);
-        else memcpy(&count, field + i * sizeof count, sizeof count), take(h, (uint32_t)count, sizeof count);
+        if (type == ANC_IS_REAL)
+            memcpy(&number, field + i * sizeof number, sizeof number), take_real(h, number);
+        else
+            memcpy(&count, field + i * sizeof count, sizeof count),
+                take(h, (uint32_t)count, sizeof count);
     }
 }
 
 /* A limiter that acts: the numbers are those of power/limiter.py in kind, and without exp. */
 static anc_limiter limiter_of(anc_real budget)
 {
-    anc_limiter c = {.scale = 1, .peak = 1, .budget = budget, .limit = 2, .planned = 16, .attack = 0.125f, .calm = 0.96875f,
-                     .fade = 0.9921875f, .release = 0.25f, .size = WINDOW, .spans = 2, .average = 1e-30f, .loud = 1e-30f, .gain = 1};
+    anc_limiter c = {.scale = 1,
+                     .peak = 1,
+                     .budget = budget,
+                     .limit = 2,
+                     .planned = 16,
+                     .attack = 0.125f,
+                     .calm = 0.96875f,
+                     .fade = 0.9921875f,
+                     .release = 0.25f,
+                     .size = WINDOW,
+                     .spans = 2,
+                     .average = 1e-30f,
+                     .loud = 1e-30f,
+                     .gain = 1};
     c.horizon[0] = WINDOW / 2, c.horizon[1] = WINDOW;
     c.held[0] = c.held[1] = 1e-30f, c.room[0] = 1, c.room[1] = 0.96875f;
     return c;
 }
 
 /* Put limiters, amplifier models and computed factors into a fresh block. */
-static void equip(void *to, const char *name, anc_role role, anc_type type, size_t offset, const int32_t shape[4])
+static void equip(void *to, const char *name, anc_role role, anc_type type, size_t offset,
+                  const int32_t shape[4])
 {
     char *field = (char *)to + offset;
     (void)role, (void)type;
     for (int32_t j = 0; j < shape[2]; j++) {
-        if (!strcmp(name, "limiter")) ((anc_limiter *)(void *)field)[j] = limiter_of(0.25f + (anc_real)j);
-        if (!strcmp(name, "amplifier")) ((anc_amplifier *)(void *)field)[j] = (anc_amplifier){(anc_real)(j % 3), 0.5f, 1.75f};
+        if (!strcmp(name, "limiter"))
+            ((anc_limiter *)(void *)field)[j] = limiter_of(0.25f + (anc_real)j);
+        if (!strcmp(name, "amplifier"))
+            ((anc_amplifier *)(void *)field)[j] = (anc_amplifier){(anc_real)(j % 3), 0.5f, 1.75f};
         if (!strcmp(name, "constraint")) {
             anc_constraint *c = (anc_constraint *)(void *)field + j;
             c->rated_power = 0.015625f, c->rate = 0.0078125f, c->supplied_factor = (anc_real)NAN;
@@ -69,15 +101,25 @@ static void equip(void *to, const char *name, anc_role role, anc_type type, size
 }
 
 /* The controller as the loop sees it. */
-typedef struct { const anc_algorithm *algorithm; anc_view view; } controller;
-static int control_signal(void *self, const anc_real *x, anc_real *y) { return ((controller *)self)->algorithm->control_signal(&((controller *)self)->view, x, y); }
-static int update(void *self, const anc_real *e) { return ((controller *)self)->algorithm->update(&((controller *)self)->view, e); }
+typedef struct {
+    const anc_algorithm *algorithm;
+    anc_view view;
+} controller;
+static int control_signal(void *self, const anc_real *x, anc_real *y)
+{
+    return ((controller *)self)->algorithm->control_signal(&((controller *)self)->view, x, y);
+}
+static int update(void *self, const anc_real *e)
+{
+    return ((controller *)self)->algorithm->update(&((controller *)self)->view, e);
+}
 
 static anc_real signal[4 * MOST][SAMPLES], reference[MOST][SAMPLES], disturbance[MOST][SAMPLES];
 
 enum { PLAIN, EQUIPPED, HARD };
 
-/* Make the input hard: tones, which excite few directions, first softly, with silence between; and a click. */
+/* Make the input hard: tones, which excite few directions, first softly, with silence between; and
+ * a click. */
 static void harden(int32_t K, int32_t I)
 {
     static const anc_real period[8] = {1, 0.75f, 0, -0.75f, -1, -0.75f, 0, 0.75f};
@@ -85,29 +127,56 @@ static void harden(int32_t K, int32_t I)
     for (int32_t n = 0; n < SAMPLES; n++) {
         const anc_real level = n < 64 ? 0x1p-20f : n < 300 || n >= 350 ? 1 : 0;
         for (int32_t i = 0; i < I; i++) reference[i][n] = level * period[(n + i) % 8];
-        for (int32_t k = 0; k < K; k++) disturbance[k][n] = level * period[(n + 3 * k) % 8] + (n == 400 ? click : 0);
+        for (int32_t k = 0; k < K; k++)
+            disturbance[k][n] = level * period[(n + 3 * k) % 8] + (n == 400 ? click : 0);
     }
 }
 
-/* Run an algorithm of a shape: plain; equipped with a guard, limiters, amplifiers, windows and computed factors; or on hard
- * input. */
+/* Run an algorithm of a shape: plain; equipped with a guard, limiters, amplifiers, windows and
+ * computed factors; or on hard input. */
 static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
 {
     static const char *const kinds[] = {"plain", "equipped", "hard"};
     const int equipped = kind == EQUIPPED;
-    static anc_real estimated[MOST * MOST * PATH], path[MOST * MOST * PATH], feedback[MOST * MOST * PATH], guard[GUARD], settings[8 * MOST];
+    static anc_real estimated[MOST * MOST * PATH], path[MOST * MOST * PATH],
+        feedback[MOST * MOST * PATH], guard[GUARD], settings[8 * MOST];
     static anc_real output[MOST * (4 * PATH + 64)], present[3 * MOST];
-    const int32_t windows[MOST] = {WINDOW, WINDOW, WINDOW}, power_windows[MOST] = {WINDOW, 0, WINDOW / 2};
+    const int32_t windows[MOST] = {WINDOW, WINDOW, WINDOW},
+                  power_windows[MOST] = {WINDOW, 0, WINDOW / 2};
     const anc_real far = kind == HARD ? 1e35f : 1e6f, limit[MOST] = {far, far, far};
-    const anc_amplifier amplifiers[MOST] = {{ANC_SOFT_SATURATION, 0.5f, 1.75f}, {ANC_HARD_CLIP, 0.5f, 1}, {ANC_LINEAR, 1, 1}};
+    const anc_amplifier amplifiers[MOST] = {
+        {ANC_SOFT_SATURATION, 0.5f, 1.75f}, {ANC_HARD_CLIP, 0.5f, 1}, {ANC_LINEAR, 1, 1}};
     controller c = {.algorithm = algorithms[number].algorithm};
-    const anc_plan plan = {.scenarios = 1, .microphones = K, .loudspeakers = J, .references = I, .taps = TAPS, .path_taps = PATH,
-                           .guard_taps = equipped ? GUARD : 0, .power_windows = equipped ? power_windows : NULL,
-                           .limiter_windows = equipped ? windows : NULL, .path = estimated, .guard = guard, .settings = settings};
-    anc_plant plant = {.scenarios = 1, .microphones = K, .loudspeakers = J, .references = I, .path_taps = PATH, .feedback_taps = equipped ? PATH : 0,
-                       .at = 3 * PATH + 64, .length = 4 * PATH + 64, .path = path, .feedback = feedback, .amplifiers = amplifiers,
-                       .output = output, .reference = present, .control = present + MOST, .error = present + 2 * MOST, .limit = limit};
-    const anc_signals signals = {SAMPLES, reference[0], disturbance[0], NULL, signal[0], signal[MOST], signal[2 * MOST], signal[3 * MOST]};
+    const anc_plan plan = {.scenarios = 1,
+                           .microphones = K,
+                           .loudspeakers = J,
+                           .references = I,
+                           .taps = TAPS,
+                           .path_taps = PATH,
+                           .guard_taps = equipped ? GUARD : 0,
+                           .power_windows = equipped ? power_windows : NULL,
+                           .limiter_windows = equipped ? windows : NULL,
+                           .path = estimated,
+                           .guard = guard,
+                           .settings = settings};
+    anc_plant plant = {.scenarios = 1,
+                       .microphones = K,
+                       .loudspeakers = J,
+                       .references = I,
+                       .path_taps = PATH,
+                       .feedback_taps = equipped ? PATH : 0,
+                       .at = 3 * PATH + 64,
+                       .length = 4 * PATH + 64,
+                       .path = path,
+                       .feedback = feedback,
+                       .amplifiers = amplifiers,
+                       .output = output,
+                       .reference = present,
+                       .control = present + MOST,
+                       .error = present + 2 * MOST,
+                       .limit = limit};
+    const anc_signals signals = {SAMPLES,   reference[0], disturbance[0],   NULL,
+                                 signal[0], signal[MOST], signal[2 * MOST], signal[3 * MOST]};
     const anc_controller seen = {&c, control_signal, update, NULL};
     int32_t status = ANC_RUNNING;
     hash y = {14695981039346656037u, NULL}, states = y;
@@ -115,7 +184,8 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
 
     random_state = 1;
     for (int i = 0; c.algorithm->settings[i].name; i++)
-        for (int32_t n = 0; n < numbers(c.algorithm->settings + i, &plan); n++) *value++ = algorithms[number].settings[kind][i];
+        for (int32_t n = 0; n < numbers(c.algorithm->settings + i, &plan); n++)
+            *value++ = algorithms[number].settings[kind][i];
     for (int32_t n = 0; n < K * J * PATH; n++, size = n % PATH ? size * 0.75f : 0.5f) {
         path[n] = n % PATH < 2 ? 0 : size * noise();
         estimated[n] = path[n] + size * noise() / 16;
@@ -124,10 +194,12 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
     for (int32_t g = 0; g < GUARD; g++) guard[g] = noise() / 16;
     for (int32_t n = 0; n < SAMPLES; n++) {
         for (int32_t i = 0; i < I; i++) reference[i][n] = noise();
-        for (int32_t k = 0; k < K; k++) disturbance[k][n] = (n < 6 ? 0 : reference[k % I][n - 6]) + noise() / 32;
+        for (int32_t k = 0; k < K; k++)
+            disturbance[k][n] = (n < 6 ? 0 : reference[k % I][n - 6]) + noise() / 32;
     }
     if (kind == HARD) harden(K, I);
-    memset(signal, 0, sizeof signal), memset(output, 0, sizeof output), memset(present, 0, sizeof present);
+    memset(signal, 0, sizeof signal), memset(output, 0, sizeof output),
+        memset(present, 0, sizeof present);
 
     printf("%s %s %d %d %d ", algorithms[number].name + 4, kinds[kind], (int)K, (int)J, (int)I);
     const size_t bytes = anc_size(c.algorithm, &plan);
@@ -151,8 +223,10 @@ int main(int argc, char **argv)
 {
 #ifdef LOADED
     library = argc > 1 ? argv[1] : "";
-    find(&size_of, "anc_size"), find(&open_block, "anc_open"), find(&describe, "anc_describe"), find(&run_loop, "anc_run");
-    for (int32_t number = 0; algorithms[number].name; number++) find(&algorithms[number].algorithm, algorithms[number].name);
+    find(&size_of, "anc_size"), find(&open_block, "anc_open"), find(&describe, "anc_describe"),
+        find(&run_loop, "anc_run");
+    for (int32_t number = 0; algorithms[number].name; number++)
+        find(&algorithms[number].algorithm, algorithms[number].name);
 #endif
     (void)argc, (void)argv;
     for (int32_t number = 0; algorithms[number].name; number++)

@@ -1,5 +1,5 @@
-/* A controller, from anc_open on, for ever: any reference and any error, whether it controls or only listens, adapts
- * or not. */
+/* A controller, from anc_open on, for ever: any reference and any error, whether it controls or
+ * only listens, adapts or not. */
 #include "signals.h"
 #include "any.h"
 #include "shape.h" /* ALGORITHM and its SETTINGS, and how many there are of what a plan has */
