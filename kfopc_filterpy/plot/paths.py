@@ -1,8 +1,4 @@
-"""Figures of paths.
-
-Each function draws into `ax`, or into new axes, and returns the axes. Paths are python-control systems, which know
-their sampling rate, or arrays of taps, which need `fs`.
-"""
+"""Figure of paths: python-control systems, which know their sampling rate, or arrays of taps, which need `fs`."""
 
 from __future__ import annotations
 

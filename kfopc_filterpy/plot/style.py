@@ -75,12 +75,12 @@ def curve_style(curve: str | int) -> dict[str, Any]:
     return {"color": colour, "linestyle": line, "marker": marker}
 
 
-def new_axes(ax: Any, rows: int = 1, sharex: bool = True) -> Any:
+def new_axes(ax: Any, rows: int = 1) -> Any:
     """Return `ax`, or `rows` new axes one above the other."""
     if ax is None:
         import matplotlib.pyplot as plt
 
-        return plt.subplots(rows, 1, figsize=(6.4, 2.4 + 1.6 * rows), sharex=sharex, layout="constrained")[1]
+        return plt.subplots(rows, 1, figsize=(6.4, 2.4 + 1.6 * rows), sharex=True, layout="constrained")[1]
     if rows > 1 and np.size(ax) != rows:
         raise ValueError(f"ax must be {rows} axes, one above the other, got {np.size(ax)}; leave it out for new")
     return ax
