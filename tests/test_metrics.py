@@ -185,6 +185,7 @@ def test_density_integrates_to_the_power():
     assert f[-1] == FS / 2
     # 2e5 independent values: the windowed estimate of the power is within 1 %.
     assert np.sum(10 ** (level / 10)) * (f[1] - f[0]) == pytest.approx(np.mean(x**2), rel=0.02)
+    assert power_spectrum_db(noise(60), FS)[1].shape == (16,)  # the steady half is shorter than a segment
 
 
 # ---- short-time power

@@ -16,6 +16,8 @@ from . import style
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_LEAST_SHARE = 1e-4  # of the peak, -40 dB, of the power of a response whose phase is drawn
+
 
 def plot_bode(
     paths: PathModel | Mapping[str, PathModel], *, fs: float | None = None, ax: Sequence[Axes] | None = None
@@ -70,9 +72,11 @@ def plot_bode(
         taps = finite_taps(path)
         delay = 0.0 if taps is None else analysis.energy_onset(taps) / sampling_rate(path, fs)
         angle = np.rad2deg(np.unwrap(np.angle(response * np.exp(2j * np.pi * frequencies * delay))))
-        angle[~style.audible(response)] = np.nan
+        angle[powers[-1] <= _LEAST_SHARE * powers[-1].max()] = np.nan  # where the phase means nothing
         phase.plot(frequencies, angle, label=f"{label}, less {1e3 * delay:.2f} ms", **style.line_style(i))
-    style.level_axis(magnitude, powers, "Magnitude (dB)")
+    peak_db = style.decibels(max(power.max() for power in powers))
+    magnitude.set_ylim(peak_db - 60, peak_db + 5)  # the zeros beneath would take all the room
+    magnitude.set_ylabel("Magnitude (dB)")
     style.phase_axis(phase, "Phase less onset delay (degrees)")
     style.frequency_axis(magnitude, frequencies).set_xlabel("")
     style.frequency_axis(phase, frequencies)

@@ -123,34 +123,16 @@ def phase_axis(ax: Axes, label: str) -> None:
 
 
 def labelled(ax: Axes, **labels: str) -> Axes:
-    """Give axes their labels, a grid and a legend, and return them."""
+    """Give axes their labels, a grid and a legend above them, where it covers no curve; return them."""
     ax.set(**labels)
     ax.grid(True, alpha=0.3)
-    return legend_above(ax)
-
-
-def legend_above(ax: Axes) -> Axes:
-    """Draw the legend above the axes, where it covers no curve, and return the axes."""
-    labels = ax.get_legend_handles_labels()[1]
+    entries = ax.get_legend_handles_labels()[1]
     # One row where it fits the width, for a longer one would squeeze the axes.
-    width = sum(len(label) + 6 for label in labels)
-    columns = len(labels) if width <= 75 else 2
+    width = sum(len(entry) + 6 for entry in entries)
+    columns = len(entries) if width <= 75 else 2
     place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": columns}
     ax.legend(**place, frameon=False, fontsize="small")
     return ax
-
-
-def level_axis(ax: Axes, powers: list[np.ndarray], label: str) -> None:
-    """Make an axis in dB that ends 60 dB below the highest peak: the zeros beneath would take all the room."""
-    peak = max(float(power.max()) for power in powers)
-    ax.set_ylim(decibels(peak) - 60, decibels(peak) + 5)
-    ax.set_ylabel(label)
-
-
-def audible(response: np.ndarray) -> np.ndarray:
-    """Return where a response lies within 40 dB of its peak: elsewhere, phase and delay mean nothing."""
-    magnitude = np.abs(response)
-    return magnitude > 0.01 * magnitude.max()
 
 
 def decibels(power: ArrayLike) -> NumberOrArray:

@@ -121,6 +121,10 @@ def _claims(path: Path, name: str) -> None:
     elif name == "x.npy":
         with open(path, "wb") as file:
             np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    elif name == "negative.npy":
+        with open(path, "wb") as file:
+            np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (-1,)})
+            file.write(bytes(80))
     elif name == "new.mat":
         WRITERS["new.mat"](path)
         with pytest.importorskip("h5py").File(path, "a") as file:
@@ -141,6 +145,7 @@ CLAIMS = {
     "x.npz": "claims 2e\\+07 samples",
     "header.npz": "claims 2e\\+07 samples",
     "x.npy": "claims 1e\\+12 samples",
+    "negative.npy": r"claims the shape \(-1,\)",
     "new.mat": "claims 1e\\+11 samples",
     "rew.txt": "with its start time it has 1.6e\\+10 samples",
 }

@@ -259,9 +259,11 @@ def test_a_file_that_is_missing_empty_or_something_else_is_refused(name, tmp_pat
 def test_a_truncated_file_is_refused(name, tmp_path):
     path = tmp_path / name
     WRITERS[name](path)
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(ValueError, match=f"{name} (is cut short|is damaged|cannot be read as a)"):
-        read_recording(path, fs=FS)
+    content = path.read_bytes()
+    for n_bytes in (200, 2) if b"fmt " in content[:64] else (200,):  # WAV says how long it is
+        path.write_bytes(content[:-n_bytes])
+        with pytest.raises(ValueError, match=f"{name} (is cut short|is damaged|cannot be read as a)"):
+            read_recording(path, fs=FS)
 
 
 def test_a_file_without_samples_is_refused(tmp_path):

@@ -251,16 +251,6 @@ def test_a_controller_that_did_better_is_chosen_or_the_verdict_says_why_not(rati
     assert any(note.startswith(f"{other}, as published, reaches {reached[other]:.1f} {why}") for note in verdict.notes)
 
 
-def test_the_levels_are_those_of_the_sounds(written):
-    verdict, _ = written
-    run = verdict.runs["KF-PB"]
-    half = run.disturbance[run.n_samples // 2 :]
-    whole = 10 * np.log10(np.sum(10 ** (verdict.levels.before_db / 10)))
-    assert whole == pytest.approx(10 * np.log10(np.mean(half**2) / 4e-10), abs=0.3)
-    less = verdict.levels.before_dba - verdict.levels.after_dba
-    assert less == pytest.approx(verdict.noise_reduction_db, abs=3.0)  # the noise is where A is flat within 3 dB or so
-
-
 def test_the_watts_of_the_lead_figure_are_written_out(written):
     ax = _bound(written[0])
     ax.figure.canvas.draw()
