@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -119,8 +118,6 @@ class SoundDevice:
             )
             self._stream.start()
         except sounddevice.PortAudioError as error:
-            with suppress(Exception):  # it has failed already, and the first error counts
-                self.stop()
             raise ValueError(
                 f"the sound card cannot be opened at {self.fs:g} Hz: {error}.{self._own_rate(sounddevice)} `python -m "
                 "sounddevice` lists the devices and their channels"

@@ -29,21 +29,21 @@ def small() -> Any:
     with smaller(cases, N_TAPS=TAPS), smaller(events, **times), smaller(tracking, **own):
         chosen = [event for event in events.all_events() if event.name in names]
         with smaller(events, all_events=lambda: chosen):
-            return run_study(tracking), events.scenes_of(chosen[1], short["duct"])
+            return run_study(tracking), events.scenes_of(chosen[0], short["duct"])
 
 
-@pytest.mark.parametrize("algorithm", ["KF-PB", "FxLMS"])
+@pytest.mark.parametrize("algorithm", ["KF-ANC", "KF-PB"])
 def test_a_row_is_that_of_plain_runs(small: Any, algorithm: str) -> None:
     report, scenes = small
-    row = row_of(report, event="sign", algorithm=algorithm)
+    row = row_of(report, event="20 dB louder", algorithm=algorithm)
     results = [plain_run(scene, algorithm, row["setting"]) for scene in scenes]
     e, d, y = (np.array([getattr(r, name) for r in results]) for name in ("error", "disturbance", "control_signal"))
     rated = scenes[0].rated_power
-    after = slice(round(0.5 * FS), round(1.2 * FS))
+    after = slice(round(0.8 * FS), round(1.6 * FS))
     assert row["noise_reduction_db"] == pytest.approx(noise_reduction_db(e, d, steady=1.0, runs=True), abs=1e-9)
     assert row["worst_window"] == pytest.approx(overshoot(y, rated, FS, window_s=0.1, runs=True), rel=1e-9)
     time = convergence_time_s(e[:, after], d[:, after], FS, window_s=0.05, runs=True)
-    assert row["settled_s"]["changed"] == (None if np.isnan(time) else pytest.approx(time))
+    assert row["settled_s"]["back"] == (None if np.isnan(time) else pytest.approx(time))
 
 
 # ---- Scenes

@@ -417,8 +417,18 @@ def test_a_block_that_comes_too_late_is_left_out_and_the_next_is_in_time(plugged
     device.stop()
 
 
-@pytest.mark.parametrize("fails", [["open"], ["start"], ["start", "stop"], ["stop"]])
-def test_a_card_that_fails_is_one_error_which_names_both_rates(plugged: Callable[..., Card], fails: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("fails", "states"),
+    [
+        (["open"], []),
+        (["start"], ["open", "stop", "close"]),
+        (["start", "stop"], ["open"]),
+        (["stop"], ["open", "start"]),
+    ],
+)
+def test_a_card_that_fails_is_one_error_which_names_both_rates(
+    plugged: Callable[..., Card], fails: list[str], states: list[str]
+) -> None:
     card = plugged()
     card.fails, card.lost_at, card.dry_at = fails, [], []
     message = rf"opened at {FS:g} Hz: Error in {fails[0]}: Invalid .* Its own rate is 44100 Hz.* lists the devices"
@@ -426,6 +436,7 @@ def test_a_card_that_fails_is_one_error_which_names_both_rates(plugged: Callable
         message = "did not stop as it should: Error in stop"
     with pytest.raises((ValueError, FaultError), match=message):
         started(PluggedDevice(card), amplitude_limit=10.0, seconds=0.5)
+    assert card.states == states
 
 
 def test_a_card_that_is_gone_is_an_error_which_one_of_stopping_does_not_hide(plugged: Callable[..., Card]) -> None:
