@@ -70,5 +70,5 @@ def cheapest_enough(
             break
     spare_db = [round(float(10 * np.log10(power / least)), 1) if least else np.inf for power in powers]
     rows = [[*listed[k], "yes" if powers[k] >= least else "no", spare_db[k]] for k in order]
-    headings = ["Amplifier", "Watt", "Ohm", "Price", "Enough", "To spare (dB)"]
+    headings = ["Amplifier", "Watt", "Ohm", "Price", "Enough", "Power to spare (dB)"]
     return found, Table("amplifiers", "Amplifiers, the cheapest that is enough first", headings, rows)

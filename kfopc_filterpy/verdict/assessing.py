@@ -313,7 +313,7 @@ def assess(
         feedback=n_heard == 0,
         loop=loop,
         timing_fault=timing_fault(np.atleast_2d(x)[0], np.atleast_2d(d)[0], fs, ("noise", "disturbance"))
-        if disturbance is not None and cause in ("coherence", "causality")
+        if disturbance is not None and cause in ("coherence", "causality", "filter", "adaptation")
         else None,
     )
     return replace(assessment, advice=tuple(advice_on(assessment)))

@@ -119,9 +119,22 @@ def test_identify_refuses_a_path_of_two_clocks_and_names_them(sent, tmp_path, ca
     assert not (tmp_path / "S.wav").exists()
 
 
-def test_a_verdict_that_coherence_limits_names_the_clocks_in_place_of_the_microphones_place(sent):
+@pytest.mark.parametrize(
+    ("heard", "limited_by", "told"),
+    [
+        (with_clock(300), "coherence", r"The delay of disturbance drifts .* \+(29[89]|30[01])\.\d ppm"),
+        (
+            np.r_[with_clock(0)[: 3 * FS], with_clock(0)[3 * FS + 256 :], np.zeros(256)],
+            "filter",
+            "From about .* 256 samples earlier",
+        ),
+    ],
+)
+def test_a_verdict_names_the_clocks_or_the_block_in_place_of_a_remedy_for_something_else(sent, heard, limited_by, told):
     plant = Plant(np.eye(16)[8], fs=FS)
     rating = AmplifierRating(8.0, sine_watt=1e5)
-    verdict = assess(sent, plant, disturbance=with_clock(300), rating=rating, want_db=20, n_taps=64, beside=())
-    assert verdict.limited_by == "coherence"
-    assert re.match(r"The delay of disturbance drifts .* \+(29[89]|30[01])\.\d ppm", verdict.advice[0])
+    verdict = assess(
+        sent, plant, disturbance=heard, rating=rating, want_db=6 if limited_by == "filter" else 20, n_taps=64, beside=()
+    )
+    assert verdict.limited_by == limited_by
+    assert re.match(told, verdict.advice[0])
