@@ -93,5 +93,5 @@ CHANGES: dict[str, Change] = {
     "fades in over 4 s from 1e-4": Change(noise=_faded(1e-4, 4.0)),
     **{f"drift of {100 * rate:g} % of a sample a second": Change(disturbance=_drifting(rate)) for rate in (0.02, 0.2)},
     "seams of a recording": Change(noise=lambda x, at, fs: np.resize(x[:at], x.size)),
-    **{f"error microphone clips at {limit:g}": Change(limit=limit) for limit in (0.1, 0.5)},
+    **{f"microphone clips at {limit:g}": Change(limit=limit) for limit in (0.1, 0.5)},
 }

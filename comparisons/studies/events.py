@@ -47,8 +47,8 @@ EVENTS: dict[str, tuple[str, float, dict[str, float]]] = {  # by name: what chan
             "drift of 2 % of a sample a second": 4.0,
             "drift of 20 % of a sample a second": 4.0,
             "seams of a recording": 3.7,
-            "error microphone clips at 0.1": 0.0,
-            "error microphone clips at 0.5": 0.0,
+            "microphone clips at 0.1": 0.0,
+            "microphone clips at 0.5": 0.0,
         }.items()
     },
     "averaging_s=600, sign at 30 s": ("primary path's sign", 30.0, {"averaging_s": 600.0}),

@@ -38,7 +38,7 @@ def test_a_microphone_that_clips_delivers_its_limit_at_most() -> None:
         def update(self, error: float) -> None:
             delivered.append(error)
 
-    event = short("error microphone clips at 0.5", 0.1)
+    event = short("microphone clips at 0.5", 0.1)
     error, _ = study.played(event, Silent())
     np.testing.assert_array_equal(error, event.disturbance)
     np.testing.assert_array_equal(delivered, np.clip(error, -0.5, 0.5))
