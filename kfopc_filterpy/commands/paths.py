@@ -72,7 +72,8 @@ def identify(options: argparse.Namespace) -> int:
             f"{options.excitation} plays each frequency once, so clocks that differ and lost samples would not show: unless "
             "one interface plays and records, play noise, or the sweep twice",
         )
-    _write_path(options.output, found.taps, files.fs)
+    units = files.units[options.response], files.units[options.excitation]
+    _write_path(options.output, found.taps, files.fs, "" if "1" in units or len(set(units)) == 1 else "/".join(units))
     facts = {"n_taps": options.taps, "fs": files.fs, "residual_db": float(found.residual_db), "output": options.output}
     text = f"{options.output}: {options.taps} taps, which leave {found.residual_db:.1f} dB of the response unexplained"
     print(json.dumps(facts) if options.json else text)
@@ -197,7 +198,7 @@ def _require_output(output: str) -> None:
     require_writable(Path(output).parent)
 
 
-def _write_path(output: str, taps: np.ndarray, fs: float) -> None:
+def _write_path(output: str, taps: np.ndarray, fs: float, unit: str) -> None:
     """Write taps in the format that the file's suffix names; text also gets a column of times in s."""
     from ..signals import write_wav
 
@@ -215,5 +216,6 @@ def _write_path(output: str, taps: np.ndarray, fs: float) -> None:
             np.save(content, taps)
             file.write(content.getbuffer())
         else:
-            timed = np.column_stack([np.arange(taps.size) / fs, taps])
-            np.savetxt(file, timed, delimiter="," if suffix == ".csv" else "\t", fmt="%.17g")
+            timed, delimiter = np.column_stack([np.arange(taps.size) / fs, taps]), "," if suffix == ".csv" else "\t"
+            heading = f"t (s){delimiter}S ({unit})" if unit else ""
+            np.savetxt(file, timed, delimiter=delimiter, fmt="%.17g", header=heading, comments="")

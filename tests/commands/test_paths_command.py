@@ -41,6 +41,17 @@ def test_files_that_a_path_does_not_explain_are_refused_and_nothing_is_written(c
     assert not (tmp_path / "S.wav").exists()
 
 
+def test_a_path_has_the_units_of_its_recordings(command, folder, tmp_path):
+    sent = np.random.default_rng(1).standard_normal(FS)
+    for name, unit, signal in (("sent", "V", sent), ("heard", "Pa", 0.5 * sent)):
+        np.savetxt(folder / f"{name}.csv", signal, header=f"x ({unit})", comments="")
+    fit = ("paths", "identify", "sent.csv", "heard.csv", "--file-fs", FS, "--taps", 4, "-o", tmp_path / "S.csv")
+    assert command(*fit)[0] == 0
+    path = read_path(tmp_path / "S.csv")
+    assert (path.unit, path.fs) == ("Pa/V", FS)
+    np.testing.assert_allclose(path.samples, [0.5, 0, 0, 0], atol=1e-4)
+
+
 def test_a_latency_that_is_longer_than_the_fit_is_named(command, folder, tmp_path):
     sent = np.random.default_rng(1).standard_normal(2 * FS)
     write_wav(folder / "sent.wav", sent, FS)
