@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from copy import deepcopy
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from scipy.signal import lfilter
 from kfopc_filterpy import OutputPowerConstraint, Plant, fx_lms, kf_opc
 from kfopc_filterpy.controllers import with_internal_model
 from kfopc_filterpy.realtime import SimulatedInterface, Supervisor
+from kfopc_filterpy.realtime.adaptation import Adaptation
 
 FS = 8000.0
 BLOCK, LATENCY = 32, 64
@@ -245,6 +247,15 @@ def test_a_divergence_is_noticed_and_acted_on() -> None:
     muted = [event.time_s for event in supervisor.health.events if event.what == "muted"]
     assert np.all(np.diff(muted) > 0.5)
     assert np.diff(muted)[-1] > np.diff(muted)[0]  # the pauses grow
+
+
+@pytest.mark.parametrize(("gain", "last"), [(1.4, ""), (1.6, "power")])
+def test_three_loud_windows_are_a_divergence_if_the_gain_has_grown(gain: float, last: str) -> None:
+    adaptation, found = Adaptation(1, 10), []
+    for level, weight in ((0.1, 1.0), *[(9.0, gain)] * 3):
+        assert adaptation.play(np.full((1, 10), level))
+        found.append(adaptation.judged(SimpleNamespace(weights=np.array([weight]), rated_power=1.0), 1e6))
+    assert found == ["", "", "", last]
 
 
 def test_long_faults_fade_out_and_in_again() -> None:
