@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import Plant, kf_pb, power_constrained_wiener, simulate
+from kfopc_filterpy import Plant, kf_opc, kf_pb, mov_fx_lms, output_power, power_constrained_wiener, simulate
 from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.signals import band_limited_noise
@@ -16,6 +17,8 @@ from ..bench import Claim, Parameter, Runs, StudyReport, Table
 from ..bench.changes import CHANGES
 from ..bench.scene import reachable_weights
 from .report_parts import report_of_rows
+
+Convert = Callable[[float, int], float]  # a reading, at a sample, to what is delivered
 
 FS, N_TAPS, RATED = 16000.0, 160, 2.1
 SECONDARY = np.array([0.0, 0.0, 0.0, 1.0, -0.8])  # a loudspeaker that is weak at low frequencies
@@ -73,20 +76,65 @@ class Event:
     settings: dict[str, Any]  # of KF-PB
 
 
-class ClippingMicrophone:
-    """A controller behind an error microphone that clips."""
+class Converted:
+    """A controller behind what a converter makes of a reading at a sample: of the error's, or of the reference's too."""
 
-    def __init__(self, controller: Any, limit: float) -> None:
-        self.controller, self.limit = controller, limit
+    def __init__(self, controller: Any, convert: Convert, *, both: bool = False) -> None:
+        self.controller, self.convert, self.both, self.n = controller, convert, both, 0
 
     def control_signal(self, reference: float) -> float:
         """Return the controller's control signal."""
-        y: float = self.controller.control_signal(reference)
+        y: float = self.controller.control_signal(self.convert(reference, self.n) if self.both else reference)
         return y
 
     def update(self, error: float) -> None:
         """Let the controller adapt to what the microphone delivers."""
-        self.controller.update(min(max(error, -self.limit), self.limit))
+        self.controller.update(self.convert(error, self.n))
+        self.n += 1
+
+
+def clipping(limit: float) -> Convert:
+    """Return a converter that clips."""
+    return lambda reading, n: min(max(reading, -limit), limit)
+
+
+CONVERTERS: dict[str, Convert] = {  # of a noise whose rms is 1
+    "none": lambda reading, n: reading,
+    "clips at 2": clipping(2.0),
+    "clips at 1": clipping(1.0),
+    "clips at 0.5": clipping(0.5),
+    "12 bits, full scale 4": lambda reading, n: round(reading * 512.0) / 512.0,
+    "offset of 0.1": lambda reading, n: reading + 0.1,
+    "one block of 32 in 100 is lost": lambda reading, n: 0.0 if n // 32 % 100 == 99 else reading,
+}
+CONVERTED: dict[str, Callable[[], Any]] = {
+    "KF-PB": lambda: kf_pb(N_TAPS, SECONDARY, rated_power=RATED, fs=FS),
+    "KF-OPC": lambda: kf_opc(
+        N_TAPS, SECONDARY, rated_power=RATED, fs=FS, state_noise=1e-9, measurement_noise=0.1, initial_variance=0.1
+    ),
+    "MOV-FxLMS": lambda: mov_fx_lms(N_TAPS, SECONDARY, rated_power=RATED, fs=FS, step_size=1e-3),
+}
+CONVERTED_S = 5  # of a run, of which the last second counts
+
+
+def converter_line(converter: str) -> list[str | float]:
+    """Return each algorithm's noise reduction in dB and its power over the rated one, behind a converter."""
+    n, last = round(CONVERTED_S * FS), slice(-round(FS), None)
+    x = band_limited_noise(BAND_HZ, CONVERTED_S, fs=FS, rng=SEED)
+    d = PLANT.disturbance(x) + SENSOR_NOISE * np.random.default_rng(SEED + 1).standard_normal(n)
+    line: list[str | float] = [converter]
+    for make in CONVERTED.values():
+        run = simulate(Converted(make(), CONVERTERS[converter], both=True), x, Plant(SECONDARY, fs=FS), disturbance=d)
+        reduced = 10 * np.log10(np.mean(d[last] ** 2) / np.mean(run.error[last] ** 2))
+        line += [round(float(reduced), 1) + 0.0, round(output_power(run.control_signal[last]) / RATED, 2)]
+    return line
+
+
+def converter_table(runs: Runs) -> Table:
+    """Return what a converter of both microphones does to algorithms that keep a rated power."""
+    headings = [word for name in CONVERTED for word in (f"{name} (dB)", "power")]
+    caption = "What a converter does: noise reduction after some seconds, and output power over the rated one"
+    return Table("converters", caption, ["converter", *headings], list(runs.map(converter_line, CONVERTERS)))
 
 
 @dataclass(frozen=True)
@@ -135,7 +183,7 @@ def bound_error(event: Event) -> np.ndarray:
 
 def played(event: Event, controller: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the error and the control signal of a run, from the first sample on."""
-    heard = controller if event.limit == np.inf else ClippingMicrophone(controller, event.limit)
+    heard = controller if event.limit == np.inf else Converted(controller, clipping(event.limit))
     run = simulate(heard, event.reference, event.plant, disturbance=event.disturbance)
     return run.error, run.control_signal
 
@@ -176,8 +224,8 @@ def event_row(name: str) -> EventRow:
 
 
 def planned_runs() -> int:
-    """Return the number of events."""
-    return len(EVENTS)
+    """Return the number of events and converters."""
+    return len(EVENTS) + len(CONVERTERS)
 
 
 def main(runs: Runs) -> StudyReport:
@@ -230,5 +278,5 @@ def main(runs: Runs) -> StudyReport:
             Claim("Loudest 100 ms of all (dB)", max(row.loudest_tenth_db for row in rows), at_most=3.0),
             Claim("Power over any averaging time", max(row.power for row in rows), at_most=1.05),
         ],
-        tables=[Table("events", "KF-PB after a change", headings, lines)],
+        tables=[Table("events", "KF-PB after a change", headings, lines), converter_table(runs)],
     )

@@ -28,20 +28,35 @@ def test_the_secondary_path_changes_its_sign_at_the_event() -> None:
     assert controller.alarms == 1
 
 
-def test_a_microphone_that_clips_delivers_its_limit_at_most() -> None:
-    delivered = []
+CONVERTED = {
+    "none": lambda x: x,
+    "clips at 0.5": lambda x: np.clip(x, -0.5, 0.5),
+    "12 bits, full scale 4": lambda x: np.round(x / 4 * 2**11) / 2**11 * 4,
+    "offset of 0.1": lambda x: x + 0.1,
+    "one block of 32 in 100 is lost": lambda x: np.where(np.arange(x.size) // 32 == 99, 0.0, x),
+}
+
+
+@pytest.mark.parametrize("name", CONVERTED)
+def test_a_converter_delivers_both_signals_changed(name: str) -> None:
+    heard, delivered = [], []
 
     class Silent:
         def control_signal(self, reference: float) -> float:
+            heard.append(reference)
             return 0.0
 
         def update(self, error: float) -> None:
             delivered.append(error)
 
-    event = short("microphone clips at 0.5", 0.1)
-    error, _ = study.played(event, Silent())
+    event = short("nothing", 0.25)
+    error, _ = study.played(event, study.Converted(Silent(), study.CONVERTERS[name], both=True))
     np.testing.assert_array_equal(error, event.disturbance)
-    np.testing.assert_array_equal(delivered, np.clip(error, -0.5, 0.5))
+    np.testing.assert_array_equal(heard, CONVERTED[name](event.reference))
+    np.testing.assert_array_equal(delivered, CONVERTED[name](error))
+    if "clips" in name:
+        study.played(replace(event, limit=0.5), Silent())
+        np.testing.assert_array_equal(delivered[error.size :], np.clip(error, -0.5, 0.5))
 
 
 AT, FS = 400, 1000.0

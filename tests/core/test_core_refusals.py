@@ -100,6 +100,15 @@ def test_settings_are_in_the_order_of_the_c_file() -> None:
         assert [one.name for one in Algorithm(name).settings] == list(ALGORITHMS[name])
 
 
+def test_a_setting_without_an_upper_limit_may_be_large() -> None:
+    limited = {"modified", "fading", "block", "averaging", "window", "memory", "spread"}
+    for name, own in ALGORITHMS.items():
+        for setting in own.keys() - limited:
+            Block(Algorithm(name), Shape(1, 1, 1, 8, 1), path=np.ones(1), settings=dict(own) | {setting: 1e6})
+    with pytest.raises(ValueError, match="modified"):
+        Block(Algorithm("mov"), Shape(1, 1, 1, 8, 1), path=np.ones(1), settings=ALGORITHMS["mov"] | {"modified": 2.0})
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_limiter_in_c_answers_nan_to_what_is_not_finite_and_keeps_its_state(bad: float) -> None:
     limiter = OutputLimiter(0.1, fs=100.0, window_s=0.1)

@@ -101,7 +101,11 @@ def test_a_sample_without_reference_leaves_the_powers_of_the_reference() -> None
     ours.secondary_path_gain = None
     other.advance(5.0, 0.5, 1.0)
     ours.advance(1.0, 0.5, 1.0)
-    assert ours.secondary_path_gain == other.secondary_path_gain
+    gain = ours.secondary_path_gain
+    assert gain == other.secondary_path_gain
+    ours.factor = 0.5
+    ours.advance(3.0)
+    assert ours.secondary_path_gain == gain
 
 
 def test_what_is_supplied_takes_part_until_it_is_taken_back() -> None:
