@@ -86,7 +86,7 @@ def main(runs: Runs) -> StudyReport:
         },
         claims=claims(rows),
         notes=without_measured(plants),
-        tables=[class_table(rows), case_table(rows)],
+        tables=[class_table(rows)],
     )
 
 
@@ -163,14 +163,3 @@ def class_table(rows: Sequence[ClassRow]) -> Table:
             [kind, len(own), power, bound.mean(), bound.min(), mov.mean(), mov.min(), first.mean(), first_power]
         )
     return Table("classes", "KF-PB by class of noise, from the second second on", headings, lines)
-
-
-def case_table(rows: Sequence[ClassRow]) -> Table:
-    """Return a line for each case."""
-    names = ("path", "noise", "share", "noise_reduction_db", "bound_db", "mov_db", "power", "first_second_db")
-    return Table(
-        "cases",
-        "Noise reduction in dB of KF-PB, of the bound of each second and of the best MOV-FxLMS",
-        [name.replace("_", " ") for name in names],
-        [[getattr(row, name) for name in names] for row in rows],
-    )
