@@ -62,3 +62,11 @@ def test_a_covariance_that_could_overflow_is_refused_and_nothing_changes() -> No
     with pytest.raises(ValueError, match="covariance P is too large"):
         controller.update(1.0)
     assert content_of(controller) == before
+
+
+def test_of_a_reference_that_is_almost_silent_the_diagonal_filter_learns_nothing() -> None:
+    """Without measurement noise, the gain is 1 / x: a weight would move by more than the longest step."""
+    controller = diagonal_kf(4, [1.0], state_noise=0.0, measurement_noise=0.0, initial_variance=1.0)
+    controller.control_signal(1e-60)
+    controller.update(1.0)
+    np.testing.assert_array_equal(controller.weights, 0.0)
