@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import platform
 import re
 import shutil
 import subprocess
@@ -217,6 +218,15 @@ def test_no_warnings(real: str, compiler: str, tmp_path: Path, no_flags: pytest.
     command = zig() if compiler == "zig" else [tool(compiler, compiler)]
     options = (*building.flags(command, real), *WARNINGS)
     ran(*command, *options, *building.core_sources(), "-o", tmp_path / "libanc.so", "-lm")
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="a flag of x86-64")
+def test_a_processor_with_half_precision_is_no_x87(tmp_path: Path) -> None:
+    """Without -std, gcc then states 16 as FLT_EVAL_METHOD, as with -march=native on such a processor."""
+    unit = tmp_path / "unit.c"
+    unit.write_text('#include "signals.h"\n_Static_assert(FLT_EVAL_METHOD == 16, "");\n')
+    flags = ("-O3", "-mavx512fp16", "-Wundef", "-Werror", f"-I{building.FOLDER}", "-fsyntax-only")
+    ran(tool("gcc", "gcc"), *flags, unit)
 
 
 @pytest.mark.parametrize(
