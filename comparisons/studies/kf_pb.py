@@ -159,7 +159,6 @@ def class_table(rows: Sequence[ClassRow]) -> Table:
     for (kind,), own in grouped(rows, "kind").items():
         bound, mov, first = (column(own, name) for name in ("over_bound_db", "over_mov_db", "first_second_db"))
         power, first_power = column(own, "power").max(), column(own, "first_power").max()
-        lines.append(
-            [kind, len(own), power, bound.mean(), bound.min(), mov.mean(), mov.min(), first.mean(), first_power]
-        )
+        figures = (power, bound.mean(), bound.min(), mov.mean(), mov.min(), first.mean(), first_power)
+        lines.append([kind, len(own), *(round(float(figure), 2) + 0.0 for figure in figures)])
     return Table("classes", "KF-PB by class of noise, from the second second on", headings, lines)
