@@ -105,8 +105,14 @@ def test_a_setting_without_an_upper_limit_may_be_large() -> None:
     for name, own in ALGORITHMS.items():
         for setting in own.keys() - limited:
             Block(Algorithm(name), Shape(1, 1, 1, 8, 1), path=np.ones(1), settings=dict(own) | {setting: 1e6})
-    with pytest.raises(ValueError, match="modified"):
-        Block(Algorithm("mov"), Shape(1, 1, 1, 8, 1), path=np.ones(1), settings=ALGORITHMS["mov"] | {"modified": 2.0})
+    for name in ("mov", "mov_fixed"):
+        with pytest.raises(ValueError, match="modified"):
+            Block(
+                Algorithm(name),
+                Shape(1, 1, 1, 8, 1),
+                path=np.ones(1),
+                settings=dict(ALGORITHMS[name]) | {"modified": 2.0},
+            )
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

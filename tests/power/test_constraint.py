@@ -73,7 +73,7 @@ def test_no_disturbance_gives_1() -> None:
     assert ours.advance(0.0) == 1.0
     assert ours.disturbance_power == 0.0
     assert ours.advance(1e-200) == 1.0  # its square is no normal number
-    assert constraint(10, secondary_path_gain=1e-320).advance(1e-155) == 1.0  # nor has a ratio digits
+    assert constraint(10, window="sliding", secondary_path_gain=1e-320).advance(1e-155) == 1.0  # nor has a ratio digits
     assert ours.advance(1.0) == pytest.approx(math.sqrt(1e-6 * 3), rel=CLOSE)
     ours.disturbance_power = 0.0
     assert ours.advance(1.0) == 1.0
