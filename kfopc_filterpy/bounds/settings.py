@@ -176,7 +176,9 @@ def suggest_settings(
     if n_taps is None:
         learned = max(float(errors[-1]), quietest) * longest * fit.per_tap * filtered_power  # q / (M P0), and below
         reached = np.maximum(fit.error_powers(learned / (memory * d_power * fit.n_microphones)), quietest)
-        taps = _shortest(reached * (1 + fit.crowding * np.arange(1, longest + 1) / memory))
+        costs = reached * (1 + fit.crowding * np.arange(1, longest + 1) / memory)
+        enough = int(np.argmax(costs <= costs.min() * 10 ** (GAIN_THAT_MATTERS_DB / 10))) + 1  # the shortest length
+        taps = min(-(-enough // MULTIPLE) * MULTIPLE, longest)
     else:
         taps = longest
     q = max(float(errors[taps - 1]), quietest)
@@ -262,12 +264,6 @@ def _longest(n_samples: int, n_path: int, n_taps: int | None, max_taps: int, cro
             f"record a longer silent run{', or cut the impulse response' if 2 * n_path > n_samples else ''}"
         )
     return min(max_taps, supported) if n_taps is None else wanted
-
-
-def _shortest(costs: np.ndarray) -> int:
-    """Return the shortest length whose cost is nearly the least, rounded up."""
-    enough = int(np.argmax(costs <= costs.min() * 10 ** (GAIN_THAT_MATTERS_DB / 10))) + 1
-    return min(-(-enough // MULTIPLE) * MULTIPLE, costs.size)
 
 
 def _burstiness(filtered: np.ndarray, fs: float, memory: float) -> float:

@@ -67,10 +67,6 @@ class Files:
         """Return the samples of a recording, one channel."""
         return self._read(path, is_path=False).one_channel()
 
-    def path(self, path: str) -> np.ndarray:
-        """Return the taps of a path."""
-        return self._read(path, is_path=True).one_channel()
-
     def calibrator(self, path: str) -> Recording:
         """Return the recording of a calibrator, at any rate."""
         return self._chosen(path, False, None)
@@ -164,7 +160,7 @@ class Files:
 def scene_of(options: argparse.Namespace, files: Files) -> tuple[np.ndarray, Plant, np.ndarray | None]:
     """Return the noise, (I, n_samples), the plant and the disturbance, (K, n_samples), if there is one."""
     from .. import Plant
-    from ..paths.file_checks import require_different
+    from ..paths.file_checks import require_different, require_each_microphone
 
     if options.secondary is None:
         raise ValueError("--secondary is needed: the impulse response from control signal to error microphone")
@@ -175,11 +171,8 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[np.ndarray, Pla
     if options.primary is not None:
         primary = files.noise_paths(options.primary, "--primary", noise)
     secondary = files.noise_paths(options.secondary, "--secondary", noise)
-    if only_errors and len(noise) != len(secondary):
-        raise ValueError(
-            f"{options.noise} must have a channel for each of the {len(secondary)} microphone(s) of --secondary, got "
-            f"{len(noise)}: choose one, as in {options.noise}:0"
-        )
+    if only_errors:
+        require_each_microphone(options.noise, noise, len(secondary), "--secondary")
     if primary is not None and primary.shape[:2] != (len(secondary), len(noise)):
         raise ValueError(
             f"--primary must give a path from each of the {len(noise)} channel(s) of {options.noise} to each of the "
@@ -194,11 +187,7 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[np.ndarray, Pla
                 "recorded together and be equally long; cut both to the same start and the same end"
             )
         require_different(options.disturbance, disturbance, options.noise, noise)
-        if len(disturbance) != len(secondary):
-            raise ValueError(
-                f"--disturbance must have a channel for each of the {len(secondary)} microphone(s) of --secondary, got "
-                f"{len(disturbance)}: record all microphones together, or choose one, as in {options.disturbance}:0"
-            )
+        require_each_microphone(options.disturbance, disturbance, len(secondary), "--secondary")
     return noise, Plant(secondary, primary, fs=files.fs), disturbance
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
 from .._validate import as_count, as_positive
-from .._writing import prepare_folder
 
 DONE, WRONG_INPUT = 0, 2
 
@@ -119,19 +118,3 @@ def add_recorded_scene(parser: argparse._ActionsContainer) -> None:
     add_number(rating, "--volts-per-unit", "V", help=about, **each)
     add_number(rating, "--rated-power", "", metavar="P", help="rated power as mean square, in place of watts", **each)
     add_number(rating, "--loudspeaker-watt", "W", help="rated noise power of the loudspeaker", **each)
-
-
-def prepare_output(options: argparse.Namespace) -> None:
-    """Raise an error if the folder cannot be written: better before the run than after it."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    if options.output is not None:
-        prepare_folder(options.output)
-
-
-def add_output(parser: argparse._ActionsContainer, about: str, about_json: str) -> None:
-    """Add the options for what is written and printed."""
-    parser.add_argument("-o", "--output", metavar="FOLDER", help=about)
-    parser.add_argument("--json", action="store_true", help=about_json)
-    parser.add_argument("--quiet", action="store_true", help="no progress bar")

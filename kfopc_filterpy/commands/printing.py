@@ -1,4 +1,4 @@
-"""What subcommands print besides their results: warnings, notes, a progress bar."""
+"""What subcommands print besides their results: warnings and notes."""
 
 from __future__ import annotations
 
@@ -6,10 +6,7 @@ import argparse
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 
 def program() -> str:
@@ -23,26 +20,3 @@ def program() -> str:
 def warn(options: argparse.Namespace, message: str, kind: str = "warning") -> None:
     """Print a warning or a note to standard error, in one line."""
     print(f"{options.prog}: {kind}: {message}", file=sys.stderr)
-
-
-def tell(options: argparse.Namespace, result: str, notes: Sequence[str]) -> None:
-    """Print a result, before its files are written, and notes on it."""
-    print(result, flush=True)
-    for note in notes:
-        warn(options, note, "note")
-
-
-def say_written(options: argparse.Namespace, page: Path, beside: str) -> None:
-    """Print which files were written."""
-    if not options.json:
-        print(f"{page} and {beside} written")
-
-
-@contextmanager
-def progress_bar(options: argparse.Namespace, unit: str) -> Iterator[Any]:
-    """Yield a progress bar, which is shown on a terminal only."""
-    import tqdm
-
-    quiet = True if options.quiet else None
-    with tqdm.tqdm(unit=unit, unit_scale=True, disable=quiet, dynamic_ncols=True, leave=False) as bar:
-        yield bar

@@ -7,10 +7,11 @@ from dataclasses import replace
 from functools import partial
 
 from .._validate import as_choice, as_nonnegative, as_number
+from .._writing import prepare_folder
 from .amplifiers import cheapest_enough
 from .inputs import Files, calibration_of, ratings_of, scene_of, take_volts, uncertainty_of
-from .options import DONE, Parser, add_command, add_count, add_number, add_output, add_recorded_scene, prepare_output
-from .printing import progress_bar, say_written, tell
+from .options import DONE, Parser, add_command, add_count, add_number, add_recorded_scene
+from .printing import warn
 
 NOT_ENOUGH = 1
 
@@ -75,11 +76,16 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     about = "recording of a sound calibrator by the error microphone, in place of --pascal-per-unit"
     parser.add_argument("--calibrator", action="append", metavar="FILE", help=about)
     add_number(parser, "--calibrator-db", "dB", as_number, default=94.0, help="its sound pressure level (default: 94)")
-    add_output(parser, "folder for the page, figures, sounds and verdict.json", "print verdict.json in place of text")
+    about = "folder for the page, figures, sounds and verdict.json"
+    parser.add_argument("-o", "--output", metavar="FOLDER", help=about)
+    parser.add_argument("--json", action="store_true", help="print verdict.json in place of text")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def verdict(options: argparse.Namespace) -> int:
     """Print a verdict, and write its page if a folder is given."""
+    import tqdm
+
     from ..verdict import assess
     from ..verdict.assessing import ALL
     from ..verdict.assessment import advice_on
@@ -87,12 +93,16 @@ def verdict(options: argparse.Namespace) -> int:
     from ..verdict.verdict_page import algorithms_table
 
     if options.output is not None:
-        prepare_output(options)
+        import matplotlib
+
+        matplotlib.use("Agg")
+        prepare_folder(options.output)  # better before the run than after it
     as_choice(options.algorithm, "--algorithm", CANDIDATES)
     files = Files(options)
     noise, plant, disturbance = scene_of(options, files)
     take_volts(options, files)
-    with progress_bar(options, "sample") as bar:
+    quiet = True if options.quiet else None  # None: quiet unless on a terminal
+    with tqdm.tqdm(unit="sample", unit_scale=True, disable=quiet, dynamic_ncols=True, leave=False) as bar:
         assessed = partial(
             assess,
             noise,
@@ -120,7 +130,11 @@ def verdict(options: argparse.Namespace) -> int:
         found = replace(found, advice=tuple(advice), notes=(*found.notes, *files.remarks), origin=origin)
     tables = ([table] if table else []) + ([algorithms_table(found)] if options.all else [])
     text = "\n".join([str(found), *(line for one in tables for line in ("", *one.lines))])
-    tell(options, found.json if options.json else text, found.notes)
+    print(found.json if options.json else text, flush=True)  # before the files are written
+    for note in found.notes:
+        warn(options, note, "note")
     if options.output is not None:
-        say_written(options, found.write(options.output), "verdict.json")
+        page = found.write(options.output)
+        if not options.json:
+            print(f"{page} and verdict.json written")
     return DONE if found.enough else NOT_ENOUGH

@@ -33,7 +33,7 @@ class BlockProcessing:
     """Gives a controller `process`, by its two methods per sample."""
 
     def process(
-        self,
+        self: Any,
         references: ArrayLike | None,
         errors: ArrayLike,
         *,
@@ -89,32 +89,20 @@ class BlockProcessing:
         >>> controller.process(block, 0.5 * block).shape
         (64,)
         """
-        return process_steps(self, references, errors, adapt=adapt, out=out)
-
-
-def process_steps(
-    controller: Any,
-    references: ArrayLike | None,
-    errors: ArrayLike,
-    *,
-    adapt: bool | ArrayLike,
-    out: np.ndarray | None,
-) -> np.ndarray:
-    """Do what `BlockProcessing.process` says for any controller, by its two methods per sample."""
-    x, e, flags, y = checked_block(controller, references, errors, adapt, out)
-    none = takes_none(controller, references)
-    with getattr(controller, "in_use", nullcontext()):
-        for n in range(x.shape[-1]):
-            sample = controller.control_signal(None if none else x[..., n])
-            if n == 0:
-                y = output_array(y, (*np.shape(sample), x.shape[-1]))
-            y[..., n] = sample
-            if flags[n] or getattr(controller, "internal_model", False):
-                try:
-                    (controller.update if flags[n] else controller.take_error)(e[..., n])
-                except ValueError as error:
-                    raise RefusedUpdate(str(error), n) from error
-    return y
+        x, e, flags, y = checked_block(self, references, errors, adapt, out)
+        none = takes_none(self, references)
+        with getattr(self, "in_use", nullcontext()):
+            for n in range(x.shape[-1]):
+                sample = self.control_signal(None if none else x[..., n])
+                if n == 0:
+                    y = output_array(y, (*np.shape(sample), x.shape[-1]))
+                y[..., n] = sample
+                if flags[n] or getattr(self, "internal_model", False):
+                    try:
+                        (self.update if flags[n] else self.take_error)(e[..., n])
+                    except ValueError as error:
+                        raise RefusedUpdate(str(error), n) from error
+        return y
 
 
 def checked_block(
@@ -123,7 +111,8 @@ def checked_block(
     """Return references, errors, whether to adapt to each sample, and the array for the control signals, if known."""
     x, e = block_signals(controller, references, errors)
     flags = adapt_flags(adapt, x.shape[-1])
-    require_apart(out, x, e)
+    if isinstance(out, np.ndarray) and any(np.may_share_memory(out, signal) for signal in (x, e)):
+        raise ValueError("out must not overlap with references or errors: give it memory of its own")
     if hasattr(controller, "multichannel"):
         out = output_array(out, ((controller.n_loudspeakers,) if controller.multichannel else ()) + x.shape[-1:])
     return x, e, flags, out
@@ -142,7 +131,11 @@ def block_signals(controller: Any, references: Any, errors: Any) -> tuple[np.nda
         if not none:
             require_channels(x, "references", controller.multichannel, controller.n_references)
         require_channels(e, "errors", controller.multichannel, controller.n_microphones)
-    require_one_length(x, e)
+    if x.shape[-1] != e.shape[-1]:
+        raise ValueError(
+            "references and errors of a block must have the same number of samples, "
+            f"got {x.shape[-1]} and {e.shape[-1]}"
+        )
     return x, e
 
 
@@ -187,15 +180,6 @@ def block_signal(value: ArrayLike, name: str) -> np.ndarray:
     return signal
 
 
-def require_one_length(references: np.ndarray, errors: np.ndarray) -> None:
-    """Raise ValueError if a block's signals differ in length."""
-    if references.shape[-1] != errors.shape[-1]:
-        raise ValueError(
-            "references and errors of a block must have the same number of samples, "
-            f"got {references.shape[-1]} and {errors.shape[-1]}"
-        )
-
-
 def adapt_flags(adapt: bool | ArrayLike, n_samples: int) -> np.ndarray:
     """Return for each sample whether to adapt to it, (n_samples,) of bool."""
     flags = np.asarray(adapt)
@@ -212,12 +196,6 @@ def require_channels(signal: np.ndarray, name: str, multichannel: bool, n_channe
     wanted = "(n_samples,)" if not multichannel else f"({n_channels}, n_samples)"
     if signal.ndim != 1 + multichannel or (multichannel and len(signal) != n_channels):
         raise ValueError(f"{name} must be {wanted} for this controller, got shape {signal.shape}")
-
-
-def require_apart(out: np.ndarray | None, *signals: np.ndarray) -> None:
-    """Raise ValueError if control signals would be written over the signals that they are computed from."""
-    if isinstance(out, np.ndarray) and any(np.may_share_memory(out, signal) for signal in signals):
-        raise ValueError("out must not overlap with references or errors: give it memory of its own")
 
 
 def output_array(out: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:

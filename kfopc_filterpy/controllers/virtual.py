@@ -289,7 +289,12 @@ class VirtualMicrophones(WrappedController):
         if not self.virtual.size:
             raise ValueError(f"virtual must name a microphone: all {self.n_microphones} of secondary are physical")
         self.observer = self._checked_observer(observer)
-        self._require_fitting_controller()
+        wanted = {"n_microphones": self.virtual.size, "n_loudspeakers": self.n_loudspeakers}
+        for name, own in differing_counts(self.controller, **wanted):
+            raise ValueError(
+                f"controller must be made for the {self.virtual.size} virtual microphones and {self.n_loudspeakers} "
+                f"loudspeakers, but its {name} is {own}: make it with the secondary paths to the virtual microphones only"
+            )
         self._sound = PlayedSound(paths, amplifier)
         self._virtual_error, self._awaits_error = np.zeros(self.virtual.size), False
 
@@ -324,14 +329,6 @@ class VirtualMicrophones(WrappedController):
                 f"but it leads from {own[1]} to {own[0]}"
             )
         return observer
-
-    def _require_fitting_controller(self) -> None:
-        wanted = {"n_microphones": self.virtual.size, "n_loudspeakers": self.n_loudspeakers}
-        for name, own in differing_counts(self.controller, **wanted):
-            raise ValueError(
-                f"controller must be made for the {self.virtual.size} virtual microphones and {self.n_loudspeakers} "
-                f"loudspeakers, but its {name} is {own}: make it with the secondary paths to the virtual microphones only"
-            )
 
     def __repr__(self) -> str:
         return f"<{self.name}: {self.physical.size} physical, {self.virtual.size} virtual>"
@@ -410,9 +407,7 @@ class VirtualMicrophones(WrappedController):
                 f"errors must be (K microphones, n_samples) with K = {self.n_microphones}, as many samples as references, "
                 f"got {np.shape(errors)} and {given.shape}"
             )
-        heard: np.ndarray = np.zeros(
-            np.shape(errors)
-        )  # what the virtual microphones hear is not used, so it may be anything
+        heard = np.zeros(np.shape(errors))  # what the virtual microphones hear is not used, so it may be anything
         heard[self.physical] = as_channels(np.asarray(errors)[self.physical], "errors")
         before = self._sound.branched(), self._virtual_error, deepcopy(self.observer), self._awaits_error
         self._advance_unheard()

@@ -157,8 +157,9 @@ def fit_noise(
         R = R_fixed + np.tensordot(factors[:, n_q:], R_matrices, 1)
         return record.log_likelihoods(Q, R)
 
-    start = _coarse_start(likelihoods, n_q, n_parts)
-    logs, value, information = _peak(likelihoods, start)
+    # Begin with the best of a grid that has one factor for all parts of Q, and one for all of R.
+    grid = np.repeat([(q, r) for q in COARSE for r in COARSE], [n_q, n_parts - n_q], axis=1)
+    logs, value, information = _peak(likelihoods, grid[np.argmax(likelihoods(np.exp(grid)))])
     factors, errors, unclear = np.exp(logs), np.full(n_parts, np.nan), np.zeros(n_parts, bool)
     for i in range(n_parts):
         others = np.tile(factors, (2, 1))
@@ -269,13 +270,6 @@ def _parts(parts: Any, own: Any, size: int, name: str) -> tuple[np.ndarray, np.n
         raise ValueError(f"{name}_parts must not be sums of multiples of each other: leave out what adds nothing")
     nothing = np.zeros((size, size))
     return (np.array(checked), nothing) if given else (np.zeros((0, size, size)), checked[0])
-
-
-def _coarse_start(likelihoods: Any, n_q: int, n_parts: int) -> np.ndarray:
-    """Return the best log-factors of a grid with one for all parts of Q, and one for all of R."""
-    grid = np.array([(q, r) for q in COARSE for r in COARSE])
-    logs = np.repeat(grid, [n_q, n_parts - n_q], axis=1)
-    return logs[np.argmax(likelihoods(np.exp(logs)))]
 
 
 def _peak(likelihoods: Any, start: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:

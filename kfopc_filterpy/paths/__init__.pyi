@@ -8,7 +8,6 @@ from .duct import duct_plant as duct_plant
 from .feedback_stability import FeedbackMargin as FeedbackMargin
 from .feedback_stability import feedback_margin as feedback_margin
 from .feedback_stability import internal_model_margin as internal_model_margin
-from .identification import IdentificationResult as IdentificationResult
 from .identification import PathEstimate as PathEstimate
 from .identification import estimate_path as estimate_path
 from .identification import identify_secondary_path as identify_secondary_path

@@ -44,7 +44,10 @@ def frequency_response(path: PathModel, frequencies_hz: ArrayLike, *, fs: float 
     >>> frequency_response([0.5, 0.5], [0.0, 2000.0, 4000.0], fs=8000.0).round(3)
     array([1. +0.j , 0.5-0.5j, 0. -0.j ])
     """
-    return _response(path, _radians(frequencies_hz, sampling_rate(path, fs)))
+    fs, f = sampling_rate(path, fs), as_signal(frequencies_hz, "frequencies_hz")
+    if f.min() < 0 or f.max() > fs / 2:
+        raise ValueError(f"frequencies_hz must lie within 0 to fs/2 = {fs / 2:g} Hz, got {f.min():g} to {f.max():g} Hz")
+    return _response(path, 2 * np.pi * f / fs)
 
 
 def _response(path: Any, omega: np.ndarray) -> np.ndarray:
@@ -65,14 +68,6 @@ def _response_on_grid(path: Any, n_frequencies: int) -> np.ndarray:
     period = 2 * (n_frequencies - 1)  # taps a period apart have the same phase at all of these frequencies
     padded = np.pad(taps, (0, -taps.size % period))
     return np.fft.rfft(padded.reshape(-1, period).sum(axis=0))
-
-
-def _radians(frequencies_hz: Any, fs: float) -> np.ndarray:
-    """Return frequencies in Hz as radians per sample."""
-    f = as_signal(frequencies_hz, "frequencies_hz")
-    if f.min() < 0 or f.max() > fs / 2:
-        raise ValueError(f"frequencies_hz must lie within 0 to fs/2 = {fs / 2:g} Hz, got {f.min():g} to {f.max():g} Hz")
-    return 2 * np.pi * f / fs
 
 
 def secondary_path_gain(path: PathModel, *, reference: ArrayLike | None = None, fs: float | None = None) -> float:

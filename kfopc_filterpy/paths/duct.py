@@ -79,10 +79,6 @@ class Duct:
         as_positive(self.loudspeaker_q, "loudspeaker_q")
         if self.loudspeaker_resonance_hz is not None:
             as_positive(self.loudspeaker_resonance_hz, "loudspeaker_resonance_hz", unit="Hz")
-        self._check_positions()
-        self._check_reflection()
-
-    def _check_positions(self) -> None:
         positions = {name: getattr(self, name) for name in ("source_m", "reference_m", "loudspeaker_m", "error_m")}
         placed = {name: as_number(x, name, unit="m") for name, x in positions.items() if x is not None}
         x = list(placed.values())
@@ -93,8 +89,6 @@ class Duct:
                 f"positions must satisfy 0 <= source_m <= reference_m <= loudspeaker_m < error_m <= length_m "
                 f"= {self.length_m:g} m, got {found}"
             )
-
-    def _check_reflection(self) -> None:
         try:
             near, far = (as_number(r, "reflection") for r in self.reflection)
         except (TypeError, ValueError) as error:

@@ -15,6 +15,15 @@ def require_different(disturbance: str, heard: np.ndarray, noise: str, reference
             )
 
 
+def require_each_microphone(name: str, heard: np.ndarray, n_microphones: int, secondary: str) -> None:
+    """Raise ValueError unless a recording, (n_channels, n_samples), has a channel for each microphone of the paths."""
+    if len(heard) != n_microphones:
+        raise ValueError(
+            f"{name} must have a channel for each of the {n_microphones} microphone(s) of {secondary}, got {len(heard)}: "
+            "record all microphones together, or choose one, as in recording.wav:0"
+        )
+
+
 def require_heard(name: str, channels: np.ndarray) -> None:
     """Raise ValueError if a channel of a recording, (n_channels, n_samples), is constant."""
     for number, channel in enumerate(channels):

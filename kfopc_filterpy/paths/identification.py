@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,27 +60,16 @@ class PathEstimate:
         Relative error of the fit that must be expected at evenly spaced frequencies from 0 to fs/2, because of noise,
         distortion and the part of the path beyond `n_taps`: a controller's ``secondary_path_uncertainty``. With several
         paths it bounds the matrix norm, see `path_uncertainty`. It knows nothing of what changes after the recording.
+    misalignment_db : float or numpy.ndarray, shape (K, J), or None
+        ``10 log10(sum (s_est - s)^2 / sum s^2)``, the error of the whole impulse response, if the true path is known:
+        from `identify_secondary_path`.
     """
 
     estimate: control.TransferFunction
     taps: np.ndarray
     residual_db: Any
     uncertainty: np.ndarray
-
-
-@dataclass(frozen=True)
-class IdentificationResult(PathEstimate):
-    """Result of a simulated identification, in which the true paths are known.
-
-    Attributes
-    ----------
-    estimate, taps, residual_db, uncertainty
-        As in `PathEstimate`.
-    misalignment_db : float or numpy.ndarray, shape (K, J)
-        ``10 log10(sum (s_est - s)^2 / sum s^2)``, the error of the whole impulse response.
-    """
-
-    misalignment_db: Any
+    misalignment_db: Any = None
 
 
 def estimate_path(
@@ -321,7 +310,7 @@ def identify_secondary_path(
     level: float = 1.0,
     regularization: float = 1e-5,
     loudspeakers: str = "in turn",
-) -> IdentificationResult:
+) -> PathEstimate:
     """Simulate the identification of secondary paths, as it is done before the control starts.
 
     The excitation runs through the amplifier and the true path, sensor noise is added, and `estimate_path` fits the
@@ -346,7 +335,7 @@ def identify_secondary_path(
 
     Returns
     -------
-    IdentificationResult
+    PathEstimate
         Estimate, residual and misalignment, of each pair of a microphone and a loudspeaker if there are several.
 
     Raises
@@ -396,9 +385,7 @@ def identify_secondary_path(
     fitted = estimate_path(sent, received, n_taps, fs, regularization=regularization)
     found = fitted.taps.reshape(K, J, -1)
     misalignments = np.array([[misalignment_db(true[k, j], found[k, j]) for j in range(J)] for k in range(K)])
-    return IdentificationResult(
-        **vars(fitted), misalignment_db=misalignments if several else float(misalignments[0, 0])
-    )
+    return replace(fitted, misalignment_db=misalignments if several else float(misalignments[0, 0]))
 
 
 def _through(sent: np.ndarray, amplifiers: Sequence[Any], paths: np.ndarray) -> np.ndarray:

@@ -63,18 +63,14 @@ def _cause(sent: np.ndarray, heard: np.ndarray, count: int, fs: float, name: str
     splits = [np.concatenate([part - part.mean() for part in np.split(delays, [at])]) for at in range(1, count)]
     at = 1 + int(np.argmin([np.sum(left**2) for left in splits]))
     jump = round(float(np.median(delays[at:]) - np.median(delays[:at])))
-    if count == 2 and abs(slope) > _LARGEST_DRIFT:
-        cause = f"in its second half, {name} is {abs(jump)} samples {'later' if jump > 0 else 'earlier'} than in its first: "
-        return cause + _LOST, every + np.where(every < every.size // 2, 0, jump)
-    if (
-        count > 2
-        and abs(jump) >= _LEAST_JUMP
-        and np.sum(splits[at - 1] ** 2) < np.sum((delays - start - slope * times) ** 2)
-    ):
-        cause = (
-            f"from about {at * size / fs:.2g} s on, {name} is {abs(jump)} samples {'later' if jump > 0 else 'earlier'} than "
-            "before: " + _LOST
-        )
+    if count == 2:
+        has_jumped, since = abs(slope) > _LARGEST_DRIFT, "in its second half"
+    else:
+        steadier = np.sum(splits[at - 1] ** 2) < np.sum((delays - start - slope * times) ** 2)
+        has_jumped, since = abs(jump) >= _LEAST_JUMP and steadier, f"from about {at * size / fs:.2g} s on"
+    if has_jumped:
+        later = "later" if jump > 0 else "earlier"
+        cause = f"{since}, {name} is {abs(jump)} samples {later} than before: {_LOST}"
         return cause, every + np.where(every < at * size, 0, jump)
     if abs(slope) * every.size >= _LEAST_DELAY:
         cause = (

@@ -9,15 +9,11 @@ import numpy as np
 
 from .._validate import as_count, as_number
 from ..loop.result import SimulationResult
-from .style import STYLES, curve_style
+from .style import COLOURS, STYLES, curve_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# The solid line is wide and lies beneath the broken ones, so that curves that coincide are both seen. Curves without an
-# algorithm of their own are broken too, in the colours that follow the paper's four algorithms.
-_BROKEN = ((0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (8, 2)), (0, (3, 1)))
-_FIRST_FREE = 4
 DISTURBANCE: dict[str, Any] = {"color": "0.6", "linestyle": "-", "linewidth": 1.2, "zorder": 1.5}
 RATED: dict[str, Any] = {"color": "0.15", "linestyle": (0, (1, 1.2)), "linewidth": 1.2}
 
@@ -80,29 +76,18 @@ def one_channel(signal: np.ndarray, channel: int | None) -> np.ndarray:
 def named_styles(labels: list[str], algorithms: list[str]) -> list[dict[str, Any]]:
     """Return the styles of curves, each with a colour of its own while there are enough.
 
-    The label's style comes first, if it is an algorithm, then the algorithm's; a curve that finds both taken is drawn
-    broken, in one of the other colours.
+    The label's style comes first, if it is an algorithm, then the algorithm's; a curve that finds both taken gets one of
+    the other colours. A solid line is wide and beneath the others, so that curves that coincide are both seen.
     """
     taken: list[dict[str, Any]] = []
+    others = [curve_style(i) for i in range(COLOURS)]
     for label, algorithm in zip(labels, algorithms, strict=True):
         colours = {style["color"] for style in taken}
-        known = [_drawn(name) for name in (label, algorithm) if name in STYLES]
-        free = [style for style in [*known, *_others()] if style["color"] not in colours]
-        taken.append((free or _others())[0])
+        known = [curve_style(name) for name in (label, algorithm) if name in STYLES]
+        style = next((one for one in [*known, *others] if one["color"] not in colours), others[0])
+        width, order = (2.2, 2.0) if style["linestyle"] == "-" else (1.4, 2.1)
+        taken.append({**style, "linewidth": width, "zorder": order})
     return taken
-
-
-def _drawn(name: str) -> dict[str, Any]:
-    order = list(STYLES).index(name)
-    return curve_style(name) | {"linewidth": 1.4 if order else 2.2, "zorder": 2.0 + 0.1 * min(order, _FIRST_FREE)}
-
-
-def _others() -> list[dict[str, Any]]:
-    colours = [(colour, marker) for colour, _, marker in list(STYLES.values())[_FIRST_FREE:]]
-    return [
-        {"color": colour, "linestyle": line, "marker": marker, "linewidth": 1.4, "zorder": 2.4}
-        for (colour, marker), line in zip(colours, _BROKEN, strict=False)
-    ]
 
 
 # Runs to be drawn together: one, several, or by name one or several.

@@ -59,14 +59,11 @@ class Adaptation:
         gain = float(np.max(np.abs(np.atleast_1d(weights)).sum(axis=-1)))
         if not gain <= largest_gain:
             return "weights"
-        if not self._is_loud(getattr(controller, "rated_power", None)):
+        rated = getattr(controller, "rated_power", None)
+        over = rated is not None and np.any(self._energy / self._counted > OVER_POWER * np.asarray(rated))
+        if not over and not np.any(self.limited > OFTEN_LIMITED * self._counted):
             self._loud_windows, self._normal_gain = 0, gain
             return ""
         self._loud_windows += 1
         grown = not gain <= GROWN * self._normal_gain < np.inf
         return "power" if self._loud_windows >= PATIENCE and grown else ""
-
-    def _is_loud(self, rated_power: Any) -> bool:
-        """Return whether a control signal far exceeds its rated power, or is often at its limit."""
-        over = rated_power is not None and np.any(self._energy / self._counted > OVER_POWER * np.asarray(rated_power))
-        return bool(over or np.any(self.limited > OFTEN_LIMITED * self._counted))

@@ -15,7 +15,7 @@ import numpy as np
 
 from .._types import PerLoudspeaker
 from .._validate import as_count, as_nonnegative, as_positive, per_loudspeaker
-from ..bounds.power_constrained import power_constrained_wiener
+from ..bounds.power_constrained import record_of_any
 from ..bounds.prediction import predictor_reference
 from ..bounds.settings import SuggestedSettings, suggest_settings
 from ..controllers.base import Controller
@@ -26,7 +26,6 @@ from .health import Health
 from .interfaces import Interface
 from .supervisor import Supervisor
 
-LOUDEST = 1e12  # times the power of the reference: a rated power that limits nothing
 WORTH_DB = 1.0  # less noise reduction than this, by any filter, is no control
 WARM_UP = 1024  # samples, so that a controller that works between blocks has done so
 FATAL, FATAL_S = 3, 600.0  # so many divergences within this time end a run
@@ -556,13 +555,12 @@ def _identified(
     if taps <= round_trip:
         raise ValueError(f"n_path must exceed the round trip, {round_trip} samples, got {n_path}")
     left = [-_without_noise(r.y[j : j + 1], r.x, r.e, taps, fs) for j, r in enumerate(recordings)]  # e = d - s * y
-    if interface.n_loudspeakers == interface.n_microphones == 1 >= interface.n_references:
-        path = _fitted(recordings[0].y[0], left[0][0], taps, fs)
-        return IdentifiedPlant(path, round_trip, silence.x[0] if len(silence.x) else silence.x, silence.e[0], fs)
     length = min(e.shape[1] for e in left)
     sent = np.array([r.y[j, :length] for j, r in enumerate(recordings)])
-    path = _fitted(sent, np.array([e[:, :length] for e in left]), taps, fs)
-    return IdentifiedPlant(path, round_trip, silence.x, silence.e, fs)
+    heard, x, e = np.array([e[:, :length] for e in left]), silence.x, silence.e
+    if interface.n_loudspeakers == interface.n_microphones == 1 >= interface.n_references:
+        sent, heard, x, e = sent[0], heard[0, 0], x[0] if len(x) else x, e[0]
+    return IdentifiedPlant(_fitted(sent, heard, taps, fs), round_trip, x, e, fs)
 
 
 def _fitted(sent: np.ndarray, heard: np.ndarray, n_taps: int, fs: float) -> PathEstimate:
@@ -639,16 +637,5 @@ def _possible_db(silence: _Heard, controller: Any, fs: float) -> float:
 
 def _best_db(x: np.ndarray, d: np.ndarray, path: Any, n_taps: int, fs: float) -> float:
     """Return the noise reduction of the best filter of some taps, whatever its power."""
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", np.exceptions.RankWarning)  # a lower bound does here
-        solution = power_constrained_wiener(
-            x,
-            Plant(path, fs=fs),
-            n_taps=n_taps,
-            rated_power=LOUDEST * float(np.mean(x**2)),
-            disturbance=d,
-            segment_s=d.shape[-1] / fs,
-        )
-    return float(np.max(solution.unconstrained.noise_reduction_db))
+    record = record_of_any(x, d, Plant(path, fs=fs), n_taps)
+    return record.solution(record.correlations().weights()).noise_reduction_db

@@ -16,7 +16,7 @@ from ..checkpoint import Checkpointed
 from ..controllers.base import Controller, WrappedController, checked_controller
 from ..controllers.channel_samples import through
 from ..controllers.core_controller import CoreController
-from ..controllers.processing import process_steps
+from ..controllers.processing import BlockProcessing
 from ..paths.uncertainty import GUARD_TAPS
 from ..power.limiter import OutputLimiter
 from .adaptation import Adaptation
@@ -109,13 +109,15 @@ class Supervisor(Checkpointed):
       limit for a tenth of the time, from a control filter whose gain has grown;
     - noise that is louder than before control, for example because a loudspeaker has the wrong polarity.
 
-    An exception of the controller, such as a refused update, is a divergence too. For the louder noise, it compares the power of the errors, the sum over the microphones, with that of the last silence.
-    If the references have become louder or softer since then, as much is expected of the errors, but no fall of more
-    than 10 dB. If the mean over `louder_s` is `louder_db` above that, where each window counts at most twice as many
-    dB, the loudspeakers fade out, and the supervisor listens for as long. If the noise is now softer by at least half
-    of `louder_db`, that was a divergence. Otherwise the noise itself has become louder, and the same controller fades
-    in again. Without a reference microphone, noise that becomes louder by itself costs such a silence each time. The
-    loudness is not watched with virtual microphones: it may rightly rise where the microphones are.
+    An exception of the controller, such as a refused update, is a divergence too.
+
+    To notice louder noise, the monitor compares the power of the errors, the sum over the microphones, with that of the
+    last silence. If the references have become louder or softer since then, as much is expected of the errors, but no
+    fall of more than 10 dB. If the mean over `louder_s` is `louder_db` above that, where each window counts at most
+    twice as many dB, the loudspeakers fade out, and the supervisor listens for as long. If the noise is now softer by
+    at least half of `louder_db`, that was a divergence. Otherwise the noise itself has become louder, and the same
+    controller fades in again. Without a reference microphone, noise that becomes louder by itself costs such a silence
+    each time. The loudness is not watched with virtual microphones: it may rightly rise where the microphones are.
 
     `save` and `load` include the controller, its copies, the fades and pauses under way, and the health record. Call
     `save` between two blocks.
@@ -468,7 +470,7 @@ class Supervisor(Checkpointed):
     def _adapted(self, x: np.ndarray, e: np.ndarray, adapt: np.ndarray) -> np.ndarray:
         """Return the controller's outputs, (J, n): zeros if it cannot go on."""
         y = np.zeros((self.n_loudspeakers, x.shape[1]))
-        process: Any = getattr(self.controller, "process", None) or partial(process_steps, self.controller)
+        process: Any = getattr(self.controller, "process", None) or partial(BlockProcessing.process, self.controller)
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 process(self._shaped(x), self._shaped(e), adapt=adapt, out=self._shaped(y))
@@ -509,8 +511,10 @@ class Supervisor(Checkpointed):
             self._loudness.begin()
         if watched == "silence":
             self._hear_silence(x, e)
-        elif watched == "control" and not self._hear_control(x, e):
-            self._watch_adaptation(y)
+        elif watched == "control" and not self._hear_control(x, e) and self._adaptation.play(y):
+            what = self._adaptation.judged(self.controller, self.largest_gain)
+            if what:
+                self._stop(f"diverged: {what}")
 
     def _hear_silence(self, x: np.ndarray, e: np.ndarray) -> None:
         """Note how loud the noise is without control; end the listening when that is known."""
@@ -533,14 +537,6 @@ class Supervisor(Checkpointed):
         self._note("louder than before control")
         self._listening, self._suspected = True, loudness.windows
         return True
-
-    def _watch_adaptation(self, y: np.ndarray) -> None:
-        """Add the control signals of a block; at the end of the window, act if the adaptation has diverged."""
-        if not self._adaptation.play(y):
-            return
-        what = self._adaptation.judged(self.controller, self.largest_gain)
-        if what:
-            self._stop(f"diverged: {what}")
 
     def _stop(self, why: str, at_once: bool = False) -> None:
         """Act on a divergence."""

@@ -40,7 +40,7 @@ from kfopc_filterpy.paths import (
     path_uncertainty,
 )
 from kfopc_filterpy.paths.analysis import energy_onset
-from kfopc_filterpy.paths.file_checks import require_different, require_heard, require_sound
+from kfopc_filterpy.paths.file_checks import require_different, require_each_microphone, require_heard, require_sound
 from kfopc_filterpy.paths.timing import timing_fault
 from kfopc_filterpy.paths.uncertainty import Uncertainty, as_uncertainty
 from kfopc_filterpy.plant import Plant, as_constant_plant, checked_signals, require_rate
@@ -249,14 +249,13 @@ def assess(
     run = runs[algorithm]
     reached = _reduction(run)
     loop = _settled_loop(run, s, secondary_path_uncertainty) if feedback else None
-    ceilings = Ceilings(
-        coherence_db=None
-        if feedback or disturbance is None
-        else max(_coherence_db(bounds.x, bounds.d, fs), bounds.time_db),
-        time_db=bounds.time_db,
-        filter_db=bounds.filter_db,
-        power_db=within_power_db,
-    )
+    coherence_db = None
+    if disturbance is not None and not feedback:
+        segment = int(
+            2 ** np.clip(np.floor(np.log2(max(bounds.x.shape[-1] / 16, 8))), 3, 14)
+        )  # as long as sixteen of them allow
+        coherence_db = max(coherence_bound(bounds.x, bounds.d, fs, segment=segment).overall_db, bounds.time_db)
+    ceilings = Ceilings(coherence_db, bounds.time_db, bounds.filter_db, within_power_db)
     cause = None if reached >= want_db else _cause(ceilings, want_db, late >= settings.n_taps)
     volts_per_unit, ohm = (scale_of(ratings, name, several) for name in ("volts_per_unit", "ohm"))
     watts = watt_per_power(volts_per_unit, ohm)
@@ -338,11 +337,11 @@ def recorded_signals(
         )
     if disturbance is not None:
         d = _recording(disturbance, "disturbance", plant.fs, length=x.shape[1])
-        _require_each_microphone(d, "disturbance", K)
+        require_each_microphone("disturbance", d, K, "secondary")
         require_different("disturbance", d, "noise", x)
     elif plant.primary is None and feedback:
         d, x = x, x[:0]
-        _require_each_microphone(d, "noise", K)
+        require_each_microphone("noise", d, K, "secondary")
     elif plant.primary is None:
         raise ValueError(
             "plant must have a primary path unless there is a disturbance: what arrives at the error microphone?"
@@ -354,13 +353,6 @@ def recorded_signals(
     if feedback:
         x = np.concatenate((x, predictor_reference(d)))
     return (x[0], d[0], s[0, 0]) if (K, J, len(x)) == (1, 1, 1) else (x, d, s)
-
-
-def _require_each_microphone(signals: np.ndarray, name: str, n_microphones: int) -> None:
-    if len(signals) != n_microphones:
-        raise ValueError(
-            f"{name} must have a channel for each of the {n_microphones} microphones of secondary, got {len(signals)}"
-        )
 
 
 def _recording(value: Any, name: str, fs: float, length: int | None = None) -> np.ndarray:
@@ -532,12 +524,6 @@ def _cause(ceilings: Ceilings, want_db: float, is_later_than_filter: bool) -> st
     return "amplifier" if ceilings.power_db < want_db else "adaptation"
 
 
-def _coherence_db(x: np.ndarray, d: np.ndarray, fs: float) -> float:
-    """Return the noise reduction that the coherence allows; segments as long as sixteen of them allow."""
-    segment = int(2 ** np.clip(np.floor(np.log2(max(x.shape[-1] / 16, 8))), 3, 14))
-    return coherence_bound(x, d, fs, segment=segment).overall_db
-
-
 def _band(d: np.ndarray, s: np.ndarray, fs: float) -> Band:
     """Return where the disturbance is, and which share of it the loudspeakers together hardly reach."""
     frequencies, powers = welch(np.atleast_2d(d), fs, nperseg=min(4096, d.shape[-1]))
@@ -552,15 +538,10 @@ def _band(d: np.ndarray, s: np.ndarray, fs: float) -> Band:
 
 
 def _levels(run: SimulationResult, pascal: Any) -> SoundLevels:
-    before, after = pascal * run.disturbance, pascal * run.error
-    centres, bands = third_octave_levels_db(before, run.fs)
-    return SoundLevels(
-        a_weighted_level_db(before, run.fs),
-        a_weighted_level_db(after, run.fs),
-        centres,
-        bands,
-        third_octave_levels_db(after, run.fs)[1],
-    )
+    sounds = pascal * run.disturbance, pascal * run.error
+    before_dba, after_dba = (a_weighted_level_db(sound, run.fs) for sound in sounds)
+    (centres, before), (_, after) = (third_octave_levels_db(sound, run.fs) for sound in sounds)
+    return SoundLevels(before_dba, after_dba, centres, before, after)
 
 
 def _a_weighted_db(signals: np.ndarray, fs: float) -> float:

@@ -281,18 +281,8 @@ class Assessment:
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict in strict JSON's types, as `verdict.schema.json` describes it."""
         same = (
-            *(
-                "enough",
-                "verdict",
-                "limited_by",
-                "reason",
-                "advice",
-                "notes",
-                "want_db",
-                "noise_reduction_db",
-                "algorithm",
-            ),
-            *("bound_db", "unlimited_power", "required_rated_power", "least_rated_power"),
+            *("enough", "verdict", "limited_by", "reason", "advice", "notes", "want_db", "noise_reduction_db"),
+            *("algorithm", "bound_db", "unlimited_power", "required_rated_power", "least_rated_power"),
             *("causality_margin_s", "helpful_delay_s", "fs", "origin"),
         )
         rating = {

@@ -130,7 +130,7 @@ def test_rates_that_differ_are_resampled_each_in_its_way(command):
         ("--primary P1.wav --secondary S1.wav --watt 1 --watt 2 --ohm 8", "--watt must be given once"),
         ("--primary P11.wav --secondary S1.wav --rated-power 1", "--primary must give a path from each"),
         ("--primary P1.wav --secondary S1.wav --secondary S12.wav --rated-power 1", "got 3 in all"),
-        ("--disturbance d.wav --secondary S1.wav --rated-power 1", "--disturbance must have a channel for each"),
+        ("--disturbance d.wav --secondary S1.wav --rated-power 1", "d.wav must have a channel for each"),
         ("--feedback --secondary S1.wav --rated-power 1", "a channel for each of the 2 microphone(s)"),
         ("--primary P1.wav --secondary S.npy --secondary S1.wav --file-fs 8000", "leave out the other"),
         ("--primary P1.wav --secondary S1.wav --microphones 0 --rated-power 1", "must be at least 1"),

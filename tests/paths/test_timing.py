@@ -72,7 +72,7 @@ def test_a_lost_block_shows_in_sweeps():
     """Between sweeps that are played twice, with its samples; in a single sweep, it may have other causes."""
     times = np.arange(N) / FS
     for seconds, lost, told in (
-        (4, 4.0, "in its second half, d is 256 samples earlier than in its first: a block was lost"),
+        (4, 4.0, "in its second half, d is 256 samples earlier than before: a block was lost"),
         (8, 4.0, "d comes 29.5 ms before x: are the files swapped, or was a block lost?"),
     ):
         heard = sweep(times - DELAY / FS + np.where(times < lost, 0, 256 / FS), seconds)

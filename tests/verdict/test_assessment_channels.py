@@ -215,7 +215,7 @@ AMPLIFIER, CONE = AmplifierRating(ohm=8.0, sine_watt=1.0), LoudspeakerRating(ohm
             {"primary": PRIMARY[:1]},
             "primary must be (K microphones, I references, taps) with the 2 microphones of secondary, got (1, 1, 64)",
         ),
-        ({"disturbance": noise()}, "disturbance must have a channel for each of the 2 microphones"),
+        ({"disturbance": noise()}, "disturbance must have a channel for each of the 2 microphone"),
         ({"secondary": APART[0]}, "secondary must have shape (K microphones, J loudspeakers, taps)"),
         ({"secondary": APART * [[[1.0]], [[0.0]]]}, "secondary[1] must not be silent"),
         ({"rating": [1.0, 1.0, 1.0]}, "an entry for each, got 3 ratings"),
