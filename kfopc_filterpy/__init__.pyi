@@ -33,12 +33,14 @@ from . import (
 )
 from .bounds.power_constrained import power_constrained_wiener as power_constrained_wiener
 from .bounds.settings import suggest_settings as suggest_settings
-from .controllers.clipping import clipping_fx_lms as clipping_fx_lms
+from .controllers.amplitude_limited import clipping_fx_lms as clipping_fx_lms
+from .controllers.amplitude_limited import rescaling_fx_lms as rescaling_fx_lms
+from .controllers.amplitude_limited import two_gradient_fx_lms as two_gradient_fx_lms
 from .controllers.diagonal import diagonal_kf as diagonal_kf
 from .controllers.estimator import KalmanController as KalmanController
 from .controllers.frequency_domain import frequency_domain_fx_lms as frequency_domain_fx_lms
 from .controllers.fxlms import fx_lms as fx_lms
-from .controllers.fxnlms import fx_nlms as fx_nlms
+from .controllers.fxlms import fx_nlms as fx_nlms
 from .controllers.fxrls import fx_rls as fx_rls
 from .controllers.kalman import kf_anc as kf_anc
 from .controllers.kalman import kf_opc as kf_opc
@@ -47,8 +49,6 @@ from .controllers.leaky import leaky_fx_lms as leaky_fx_lms
 from .controllers.leaky import optimal_leaky_fx_lms as optimal_leaky_fx_lms
 from .controllers.limited import LimitedController as LimitedController
 from .controllers.mov import mov_fx_lms as mov_fx_lms
-from .controllers.rescaling import rescaling_fx_lms as rescaling_fx_lms
-from .controllers.two_gradient import two_gradient_fx_lms as two_gradient_fx_lms
 from .filters.kfopc import KFOPC as KFOPC
 from .loop.result import SimulationResult as SimulationResult
 from .loop.simulation import simulate as simulate

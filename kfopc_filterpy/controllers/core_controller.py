@@ -117,11 +117,14 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
             constraint_for(rated_power, constraint, fs, self._path_fs) if self._constrained else None
         )
         models = amplifier_models(amplifier, self.n_loudspeakers)
+        wanted = {one.name for one in Algorithm(algorithm).settings}
+        if set(settings) != wanted:
+            raise TypeError(f"{self.name} has the settings {sorted(wanted)}, got {sorted(settings)}")
         block = Block(
             Algorithm(algorithm),
             self._needed_shape(path.shape[-1], guard_taps=0),
             path=path,
-            settings=self._checked_settings(settings),
+            settings={name: self._checked_setting(name, value) for name, value in settings.items()},
         )
         block.fields["amplifier"][0, 0] = models
         self._use_block(block)
@@ -156,13 +159,6 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         return filters if self.multichannel or filters.shape[:2] != (1, 1) else filters[0, 0]
 
     # Checks of what the user gives.
-
-    def _checked_settings(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings, checked."""
-        wanted = {one.name for one in Algorithm(self.algorithm).settings}
-        if set(settings) != wanted:
-            raise TypeError(f"{self.name} has the settings {sorted(wanted)}, got {sorted(settings)}")
-        return {name: self._checked_setting(name, value) for name, value in settings.items()}
 
     def _checked_setting(self, name: str, value: Any) -> Any:
         """Return a checked setting: a number, or an array if each of several channels has its own."""

@@ -1,7 +1,8 @@
-"""The filtered-reference LMS without a constraint."""
+"""The filtered-reference LMS without a constraint, with a fixed or a normalised step."""
 
 from __future__ import annotations
 
+from .._validate import as_positive
 from ..plant import Secondary
 from ..power.limiter import Limiters
 from .core_controller import CoreController
@@ -94,6 +95,76 @@ def fx_lms(
         n_taps,
         secondary,
         settings={"step_size": step_size},
+        n_references=n_references,
+        limiter=limiter,
+    )
+
+
+@controller_maker
+def fx_nlms(
+    n_taps: int,
+    secondary: Secondary,
+    *,
+    step_size: float,
+    regularization: float | None = None,
+    n_references: int = 1,
+    limiter: Limiters = None,
+) -> CoreController:
+    r"""Return FxNLMS, normalised FxLMS: the step is divided by the energy of the filtered reference.
+
+    .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{x'(n)^T x'(n)}
+
+    One step size therefore suits soft and loud noise. In a quiet passage, the energy counts as at least a thousandth of
+    the usual one; otherwise the weights would follow the noise of the microphones. The usual energy is that of the last
+    thousand filter lengths. Weights that were learned from a reference 40 dB softer begin anew, as they hold little but
+    that noise. With a regularization, neither holds. With several channels, the steps of all filters are divided by the
+    same energy, that of all filtered references together. So their direction remains that of the multiple-error LMS:
+
+    .. math:: w_{ji}(n+1) &= w_{ji}(n) \\ &\quad + \mu \frac{\sum_k e_k(n)\, x'_{kji}(n)}
+       {\sum_{k,j,i} x'_{kji}(n)^T x'_{kji}(n)}
+
+    Parameters
+    ----------
+    n_taps, secondary, n_references, limiter
+        As for `fx_lms`.
+    step_size : float
+        Step size mu, above zero; below 2 for secondary paths without delay, and smaller for longer paths.
+    regularization : float, optional
+        Energy epsilon, above zero, that is added to the energy instead; in the unit of the squared filtered reference.
+
+    Returns
+    -------
+    CoreController
+        A controller named FxNLMS.
+
+    Raises
+    ------
+    ValueError
+        A step size or regularization that is not positive and finite, fewer than one tap, a path that is not FIR.
+
+    References
+    ----------
+    S. M. Kuo, D. R. Morgan, "Active noise control: a tutorial review", Proc. IEEE 87(6), 1999. For several channels,
+    S. J. Elliott, Signal Processing for Active Control, Academic Press 2001, ch. 5. The energy of all channels is the
+    trace of the matrix whose largest eigenvalue limits the step size there.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import fx_nlms
+    >>> controller = fx_nlms(4, [1.0], step_size=0.5)
+    >>> controller.control_signal(2.0)
+    0.0
+    >>> controller.update(4.0)
+    >>> float(controller.weights[0])  # 0.5 * 4 * 2 / 2^2
+    1.0
+    """
+    epsilon = 0.0 if regularization is None else as_positive(regularization, "regularization")
+    return CoreController(
+        "FxNLMS",
+        "fxnlms",
+        n_taps,
+        secondary,
+        settings={"step_size": step_size, "regularization": epsilon},
         n_references=n_references,
         limiter=limiter,
     )

@@ -6,18 +6,15 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from .clipping import clipping_fx_lms
+from .amplitude_limited import clipping_fx_lms, rescaling_fx_lms, two_gradient_fx_lms
 from .diagonal import diagonal_kf
 from .frequency_domain import frequency_domain_fx_lms
-from .fxlms import fx_lms
-from .fxnlms import fx_nlms
+from .fxlms import fx_lms, fx_nlms
 from .fxrls import fx_rls
 from .kalman import kf_anc, kf_opc
 from .kf_pb import kf_pb
 from .leaky import leaky_fx_lms, optimal_leaky_fx_lms
 from .mov import mov_fx_lms
-from .rescaling import rescaling_fx_lms
-from .two_gradient import two_gradient_fx_lms
 
 # In the compiled core, so that they can be exported.
 CORE: dict[str, Callable[..., Any]] = {

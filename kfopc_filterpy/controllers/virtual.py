@@ -407,7 +407,8 @@ class VirtualMicrophones(WrappedController):
                 f"errors must be (K microphones, n_samples) with K = {self.n_microphones}, as many samples as references, "
                 f"got {np.shape(errors)} and {given.shape}"
             )
-        heard = np.zeros(np.shape(errors))  # what the virtual microphones hear is not used, so it may be anything
+        # What the virtual microphones hear is not used, so it may be anything.
+        heard: np.ndarray = np.zeros(np.shape(errors))
         heard[self.physical] = as_channels(np.asarray(errors)[self.physical], "errors")
         before = self._sound.branched(), self._virtual_error, deepcopy(self.observer), self._awaits_error
         self._advance_unheard()

@@ -110,8 +110,11 @@ def constrained(
         centre, directions = centre + directions @ step, directions @ free
     if power is None:
         state = centre + directions @ _least_distance(A @ directions, b - A @ centre)
+    elif not isinstance(power, tuple | list) or len(power) != 2:
+        raise TypeError(f"power must be a pair of a matrix ({n}, {n}) and a limit, got {type(power).__name__}")
     else:
-        state = _within_power(centre, directions, A, b, *_checked_power(power, n))
+        M, rho = as_covariance(power[0], n, "power[0]"), as_positive(power[1], "power[1]")
+        state = _within_power(centre, directions, A, b, M, rho)
     state = state.reshape(estimate.shape)
     if project:
         kf.x = state.copy()
@@ -170,13 +173,6 @@ def _all_inequalities(inequalities: Any, lower: Any, upper: Any, n: int) -> tupl
         limited = np.isfinite(ends[name])
         A, b = np.vstack([A, sign * np.eye(n)[limited]]), np.append(b, sign * ends[name][limited])
     return A, b
-
-
-def _checked_power(power: Any, n: int) -> tuple[np.ndarray, float]:
-    """Return the matrix M and the limit rho of x' M x <= rho."""
-    if not isinstance(power, tuple | list) or len(power) != 2:
-        raise TypeError(f"power must be a pair of a matrix ({n}, {n}) and a limit, got {type(power).__name__}")
-    return as_covariance(power[0], n, "power[0]"), as_positive(power[1], "power[1]")
 
 
 def _on_equalities(G: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -50,18 +50,15 @@ class Adaptation:
 
     def judged(self, controller: Any, largest_gain: float) -> str:
         """Return what shows a divergence in this window, empty if nothing does, and begin the next one."""
-        what = self._divergence(controller, largest_gain)
+        power, often = self._energy / self._counted, np.any(self.limited > OFTEN_LIMITED * self._counted)
         self.begin()
-        return what
-
-    def _divergence(self, controller: Any, largest_gain: float) -> str:
         weights = getattr(controller, "control_filter", getattr(controller, "weights", np.zeros(1)))
         gain = float(np.max(np.abs(np.atleast_1d(weights)).sum(axis=-1)))
         if not gain <= largest_gain:
             return "weights"
         rated = getattr(controller, "rated_power", None)
-        over = rated is not None and np.any(self._energy / self._counted > OVER_POWER * np.asarray(rated))
-        if not over and not np.any(self.limited > OFTEN_LIMITED * self._counted):
+        over = rated is not None and np.any(power > OVER_POWER * np.asarray(rated))
+        if not over and not often:
             self._loud_windows, self._normal_gain = 0, gain
             return ""
         self._loud_windows += 1

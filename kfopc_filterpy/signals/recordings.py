@@ -319,20 +319,15 @@ def calibration_factor(
     drift = 10 * np.log10(max(quarters) / min(quarters))
     if drift > _LARGEST_DRIFT_DB:
         raise ValueError(f"{what} must have a steady level, but it drifts by {drift:.1f} dB: cut out the steady part")
-    share = _tone_share(signal)
+    power = np.abs(np.fft.rfft(signal * np.hanning(signal.size))) ** 2
+    peak = int(np.argmax(power))
+    reach = max(3, round(0.03 * peak))  # the tone is within 3 % of the strongest frequency
+    share = float(np.sum(power[max(0, peak - reach) : peak + reach + 1]) / np.sum(power))
     if share < _LEAST_TONE_SHARE:
         raise ValueError(
             f"{what} must be one tone, but only {100 * share:.0f} % of its power is: record the calibrator alone, unclipped"
         )
     return _REFERENCE_PRESSURE * 10 ** (level / 20) / math.sqrt(share * np.mean(signal**2))
-
-
-def _tone_share(signal: np.ndarray) -> float:
-    """Return the share of the power within 3 % of the strongest frequency."""
-    power = np.abs(np.fft.rfft(signal * np.hanning(signal.size))) ** 2
-    peak = int(np.argmax(power))
-    reach = max(3, round(0.03 * peak))
-    return float(np.sum(power[max(0, peak - reach) : peak + reach + 1]) / np.sum(power))
 
 
 def read_content(path: str | os.PathLike[str], *, channel: int | None = None, variable: str | None = None) -> Content:
