@@ -29,8 +29,8 @@ def report(title: str = "own") -> StudyReport:
 
 
 WRITERS: dict[str, Callable[[Path], object]] = {
-    "S.csv": lambda folder: _write_path(str(folder / "S.csv"), np.ones(300), FS),
-    "S.NPY": lambda folder: _write_path(str(folder / "S.NPY"), np.ones(300), FS),
+    "S.csv": lambda folder: _write_path(str(folder / "S.csv"), np.ones(300), FS, "1"),
+    "S.NPY": lambda folder: _write_path(str(folder / "S.NPY"), np.ones(300), FS, "1"),
     "error.wav": lambda folder: write_wav(folder / "error.wav", np.ones(500), FS),
     "figure.svg": lambda folder: save_figure(Figure(), folder / "figure"),
     "anc.c": lambda folder: export_c(fx_lms(8, [1.0], step_size=0.1), folder / "anc.c"),
@@ -100,12 +100,13 @@ def test_files_that_belong_together_are_new_once_all_are_written_with_those_at_t
 
 
 def test_what_a_killed_process_left_is_removed_after_an_hour(tmp_path):
-    left = [tmp_path / f".x.wav.{name}.part" for name in ("old", "own")]
-    for path in left:
+    old, own, other = (tmp_path / f".{name}.part" for name in ("x[1].wav.old", "x[1].wav.own", "x1.wav.old"))
+    for path in (old, own, other):
         path.write_text("")
-    os.utime(left[0], (0, 0))
-    write_wav(tmp_path / "x.wav", np.ones(3), FS)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [left[1].name, "x.wav"]
+    for path in (old, other):
+        os.utime(path, (0, 0))
+    write_wav(tmp_path / "x[1].wav", np.ones(3), FS)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [other.name, own.name, "x[1].wav"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")

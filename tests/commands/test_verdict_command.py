@@ -128,14 +128,6 @@ def test_a_list_of_amplifiers_that_is_wrong_is_refused(command, folder, text, mo
     assert message in err
 
 
-def test_a_process_ends_with_1_if_it_is_not(folder):
-    ended = process(folder, "verdict", *SCENE, "--rated-power", "0.05", "--taps", "32", "--json", "--quiet")
-    assert ended.returncode == 1, ended.stderr
-    data = json.loads(ended.stdout)
-    assert data["limited_by"] == "amplifier"
-    assert data["rating"]["ohm"] is None
-
-
 def test_a_verdict_names_options_in_its_advice_and_on_its_page(command, tmp_path):
     write = ["-o", tmp_path / "out"]
     code, out, _ = command("verdict", *SCENE, "--rated-power", "4", "--taps", "8", "--want-db", "12", *write)

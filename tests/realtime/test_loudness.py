@@ -244,12 +244,6 @@ def test_noise_that_becomes_louder_unheard_by_a_reference_costs_a_silence(contro
 # How it begins.
 
 
-def test_it_listens_first_and_then_fades_in() -> None:
-    _, e, d = controlled(MAKERS["FxLMS"](PATH), louder_s=2.0)
-    assert db(e, d, 0.0, 2.0) == pytest.approx(0.0, abs=1e-9)
-    assert db(e, d, 3.0, 4.0) < -10.0
-
-
 def test_what_was_heard_before_takes_its_place() -> None:
     """The level, the controller's powers, and faults, whose time is negative."""
     controller = MAKERS["KF-OPC"](-PATH)

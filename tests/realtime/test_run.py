@@ -89,17 +89,6 @@ def test_a_run_identifies_fades_in_reduces_and_fades_out() -> None:
     assert report.controller.weights.shape == (24,)
 
 
-def test_several_loudspeakers_and_microphones() -> None:
-    paths = np.zeros((2, 2, 4))
-    paths[:, :, 1] = [[0.9, 0.2], [0.1, 0.8]]
-    primary = np.stack((PRIMARY, np.roll(0.7 * PRIMARY, 3)))[:, np.newaxis]
-    interface = SimulatedInterface(X, Plant(paths, primary, fs=FS), block=32, latency=64)
-    report = started(interface, step_size=1e-3, amplitude_limit=[8.0, 8.0], seconds=2.0)
-    assert report.secondary is not None
-    np.testing.assert_allclose(report.secondary.taps[:, :, 65], paths[:, :, 1], atol=1e-3)
-    assert np.all(report.reduction_db > 6.0)
-
-
 @pytest.mark.parametrize(("several", "white"), [(False, 0.0), (True, 0.05)])
 def test_a_run_with_an_internal_model(several: bool, white: float) -> None:
     """A tone that no reference microphone hears can be predicted over the two blocks.
@@ -124,7 +113,8 @@ def test_a_run_with_an_internal_model(several: bool, white: float) -> None:
             fx_lms(24, plant.taps, step_size=1e-3, n_references=n_heard + interface.n_microphones)
         )
 
-    report = run(make, interface, amplitude_limit=8.0, seconds=3.0, listen_s=0.5, identify_s=2.0)
+    limits = [8.0, 8.0] if several else 8.0
+    report = run(make, interface, amplitude_limit=limits, seconds=3.0, listen_s=0.5, identify_s=2.0)
     assert report.stopped_by == "end"
     assert report.secondary is not None
     exact = np.zeros_like(report.secondary.taps)
