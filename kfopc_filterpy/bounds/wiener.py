@@ -423,8 +423,9 @@ def reduction_db(error_power: float, disturbance_power: float) -> float:
 def loss_db(stretch: Record, correlations: Any, weights: np.ndarray, penalty: float = 0.0, ridge: float = 0.0) -> float:
     """Return by how many dB weights in the directions left out would lower the error, 0 if it does not matter.
 
-    Of several channels that is not known, and 0 as well. With a penalty or a ridge, the error is that of the penalised problem. The signals themselves resolve weights that
-    their correlations do not: a QR decomposition of evenly spaced samples is compared with `weights` at those samples.
+    Of several channels that is not known, and 0 as well. With a penalty or a ridge, the error is that of the penalised
+    problem. The signals themselves resolve weights that their correlations do not: a QR decomposition of evenly spaced
+    samples is compared with `weights` at those samples.
     """
     from scipy.linalg import lstsq
 

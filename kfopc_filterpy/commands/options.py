@@ -71,11 +71,9 @@ def refuse_unused(options: argparse.Namespace, names: Iterable[str], why: str) -
         raise ValueError(f"{' and '.join(unused)} would not be used{why}")
 
 
-def add_reading(
-    parser: argparse._ActionsContainer, about_fs: str = "resample everything to this rate", **of_fs: Any
-) -> None:
+def add_reading(parser: argparse._ActionsContainer, about_fs: str = "resample everything to this rate") -> None:
     """Add the options for reading files."""
-    add_number(parser, "--fs", "Hz", help=about_fs, **of_fs)
+    add_number(parser, "--fs", "Hz", help=about_fs)
     add_number(parser, "--file-fs", "Hz", help="rate of the files that state none")
 
 

@@ -252,10 +252,10 @@ class KFOPC(KalmanFilter, Checkpointed):
         Parameters
         ----------
         z : float, array_like or None
-            Measurement, (dim_z, 1) or what converts to it. None is a missed sample: nothing is corrected and
-            no power estimate advances. Masked components of a masked array, and None among others, are missing: the state is corrected by
-            the others, with their rows of H and R. `z` is NaN there, `y` and the column of `K` are 0, and the likelihoods
-            are those of the others. All masked is None.
+            Measurement, (dim_z, 1) or what converts to it. None is a missed sample: nothing is corrected and no power
+            estimate advances. Masked components of a masked array, and None among others, are missing: the state is
+            corrected by the others, with their rows of H and R. `z` is NaN there, `y` and the column of `K` are 0, and
+            the likelihoods are those of the others. All masked is None.
         R : float or array_like, optional
             Measurement noise variance of this step; by default `self.R`.
         H : array_like, optional

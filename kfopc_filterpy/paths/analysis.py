@@ -189,7 +189,8 @@ class CausalityMargin:
     ----------
     primary_onset_s : float or numpy.ndarray, shape (K,)
         Energy onset of the primary path in s: the time by which its impulse response has delivered 1 % of its energy,
-        which ignores the ringing before a band-limited arrival. With several channels the earliest over the references, at each microphone.
+        which ignores the ringing before a band-limited arrival. With several channels the earliest over the references,
+        at each microphone.
     secondary_onset_s : float or numpy.ndarray, shape (K, J)
         Energy onset of the secondary path, or of that from each loudspeaker to each microphone; inf for a silent one.
     fs : float

@@ -50,9 +50,10 @@ class Health:
         Number of samples concerned, by what happened.
     counts : collections.Counter
         Number of events, by what happened: "not finite", "clipped", "stuck", "offset", "repeated" and "lost" samples of
-        the microphones; what was "refused" in silence; "limited" control signals; "output underflow", a block that came too late
-        for the output; "diverged: ..." and then "muted"; "louder than before control", which ends in "diverged: louder
-        than without control" or "the noise itself is louder"; "silent: no usable input" and "running again".
+        the microphones; what was "refused" in silence; "limited" control signals; "output underflow", a block that came
+        too late for the output; "diverged: ..." and then "muted"; "louder than before control", which ends in
+        "diverged: louder than without control" or "the noise itself is louder"; "silent: no usable input" and "running
+        again".
 
     Examples
     --------
