@@ -238,10 +238,7 @@ HEAD = "import sys\nread, write = sys.stdin.buffer.read, sys.stdout.buffer.write
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (
-            "raise SystemExit('no licence')",
-            "answered 0 of 128 bytes in block 0 and ended with status 1: no licence",
-        ),
+        ("raise SystemExit('no licence')", "answered 0 of 128 bytes in block 0 and ended with status 1: no licence"),
         ("raise SystemExit('ended first')", "answered 0 of 128 bytes in block 0 and ended with status 1: ended first"),
         (HEAD + "read(256), write(bytes(64))", "answered 64 of 128 bytes in block 0 and ended with status 0"),
         (HEAD + "read(256), write(b'\\xff' * 128), sys.stdout.flush(), read()", "answered NaN or Inf in block 0"),

@@ -73,11 +73,7 @@ TONE = np.sin(2 * np.pi * 0.03 * T)
         ("reference dead for 10 s", "reference", 0.0 * TONE),
         ("a reference sample of 1e4", "reference", np.where(T == AT, 1e4 / np.sqrt(2.0), TONE)),
         ("soft past, 1e-3", "noise", TONE),
-        (
-            "drift of 20 % of a sample a second",
-            "disturbance",
-            np.sin(2 * np.pi * 0.03 * (T - 0.2 * (T - AT) / FS)),
-        ),
+        ("drift of 20 % of a sample a second", "disturbance", np.sin(2 * np.pi * 0.03 * (T - 0.2 * (T - AT) / FS))),
     ],
 )
 def test_a_change_is_what_its_name_says(what: str, signal: str, later: np.ndarray) -> None:

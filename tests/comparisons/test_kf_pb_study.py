@@ -24,10 +24,7 @@ SMALL = {"N_TAPS": 16, "SILENT_S": 1.0, "DURATION_S": 5.0, "SHARES": (0.25,)}
 def report() -> Iterator[StudyReport]:
     """Few taps, short runs, one pair of short paths, one setting of MOV-FxLMS, no measured data."""
     settings = {"STEPS": np.array([0.01]), "PENALTIES": np.array([1.0])}
-    own = {
-        "JUMPS": {"12 dB louder from 3 s on": (12.0, 3.0, 5.0)},
-        "all_plants": lambda: {"short": PLANT},
-    }
+    own = {"JUMPS": {"12 dB louder from 3 s on": (12.0, 3.0, 5.0)}, "all_plants": lambda: {"short": PLANT}}
     with smaller(kf_pb_cases, **SMALL, **own), smaller(study, **settings):
         yield run_study(study)
 

@@ -109,11 +109,8 @@ def page(tmp_path_factory):
     listening.write_script(folder)
     text = (ROOT / "docs" / "listen.md").read_text(encoding="utf-8")
     (body,) = re.findall(r"```\{raw\} html\n(.*?)```", text, re.S)
-    (folder / "page.html").write_text(
-        f"<!doctype html><meta charset=utf-8>{body.replace('_static/', '')}", encoding="utf-8"
-    )
-    phone = '<!doctype html><meta charset=utf-8><meta name="viewport" content="width=device-width">'
-    (folder / "phone.html").write_text(phone + body.replace("_static/", ""), encoding="utf-8")
+    head = '<!doctype html><meta charset=utf-8><meta name="viewport" content="width=device-width">'
+    (folder / "page.html").write_text(head + body.replace("_static/", ""), encoding="utf-8")
     return (folder / "page.html").as_uri()
 
 
@@ -166,7 +163,7 @@ def test_the_page_fits_a_phone_and_a_screen(width, page, browser):
     shape = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", shape)
     try:
-        browser.get(page.replace("page.html", "phone.html"))
+        browser.get(page)
         assert browser.execute_script("return document.documentElement.scrollWidth") <= width
         button, controls, word = (
             browser.execute_script("return document.querySelector(arguments[0]).getBoundingClientRect()", which)

@@ -110,9 +110,3 @@ def test_what_may_surprise_is_as_in_filterpy(code: str) -> None:
     assert state_of(kf) == state_of(ours)
     each, own = (one if isinstance(one, tuple) else (one,) for one in (value, own_value))
     assert exactly(*each) == exactly(*own)
-
-
-@pytest.mark.parametrize("R", [2.0, None, [[3.0]]])
-def test_an_R_that_does_not_fit_the_rows_of_H_is_named(R: Any) -> None:
-    with pytest.raises(ValueError, match=r"R must have shape \(2, 2\), as H has rows, got .* for dim_z = 1"):
-        KFOPC(3, 1).update([1.0, 2.0], R=R, H=np.eye(2, 3))

@@ -57,6 +57,7 @@ def smooth(f: KFOPC, **changed: Any) -> None:
 
 # ---- Lines of code and what their last statement says; what stands before it is done with the twin, too.
 
+FITS_NOT = r"R must have shape \(2, 2\), as H has rows, got .* for dim_z = 1|needs one measurement, got 2"
 UPDATES = {
     'f.update("loud")': "z must be a number or an array of numbers, or None",
     "f.update(nan)": r"z must be finite.*If a value is missing, mask it",
@@ -72,6 +73,7 @@ UPDATES = {
     "f.update(1.0, R=nan, reference=1.0)": "R must be finite",
     "f.update(1.0, R=-1.0, reference=1.0)": "R must not be negative",
     "f.update(1.0, R=np.eye(2), reference=1.0)": "R must (have shape|be a single number)",
+    **{f"f.update([1.0, 2.0], R={R}, H=ones((2, 5)), reference=1.0)": FITS_NOT for R in ("2.0", "None", "[[3.0]]")},
     "f.update(1.0, R=0.0, H=0 * ROW, reference=1.0)": "a silent reference",
     "f.update(1.0, H=1e160 * ROW, reference=1.0)": "overflow|finite square",
     "f.update(1.0, R=1e-310, H=1e-160 * ROW, reference=1.0)": "overflow",

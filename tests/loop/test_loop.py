@@ -9,14 +9,7 @@ from helpers.simulation import Stepwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy import (
-    HardClipAmplifier,
-    OutputPowerConstraint,
-    Plant,
-    kf_opc,
-    mov_fx_lms,
-    simulate,
-)
+from kfopc_filterpy import HardClipAmplifier, OutputPowerConstraint, Plant, kf_opc, mov_fx_lms, simulate
 from kfopc_filterpy.loop.simulation import STRETCH
 
 

@@ -8,13 +8,7 @@ import pytest
 from helpers.comparing import SIGNALS
 from helpers.simulation import FS, MAKERS, PLANT, D, Integrator, S, Stepwise, X, noises
 
-from kfopc_filterpy import (
-    HardClipAmplifier,
-    KalmanController,
-    Plant,
-    SoftSaturationAmplifier,
-    simulate,
-)
+from kfopc_filterpy import HardClipAmplifier, KalmanController, Plant, SoftSaturationAmplifier, simulate
 from kfopc_filterpy.controllers import CoreController
 from kfopc_filterpy.filters import RandomWalkKFOPC
 

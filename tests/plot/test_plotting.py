@@ -61,6 +61,14 @@ def _line(ax, label):
     return next(line for line in ax.get_lines() if line.get_label() == label)
 
 
+def require_nse(ax, label, e, d, *window_s, **options):
+    """The line has the NSE at some of the samples; return which."""
+    line = _line(ax, label)
+    rows = np.round(line.get_xdata() * FS).astype(int) - 1
+    np.testing.assert_array_equal(line.get_ydata(), nse_db(e, d, FS, *window_s, **options)[rows])
+    return rows
+
+
 def test_error_spectra_hold_the_disturbance_and_each_error(tonal):
     ax = plotting.plot_error_spectra(list(tonal.values()), band=(100.0, 5000.0), segment_s=0.05)
     assert _labels(ax) == ["Disturbance", *tonal]
@@ -106,12 +114,8 @@ def test_amplifier_output_with_limit_and_the_signal_before_it(tonal):
 
 def test_nse_pools_seeds_and_shows_the_start(noise):
     ax = plotting.plot_nse({"KF-OPC": noise}, window_s=0.005)
-    curve = nse_db(
-        np.stack([run.error for run in noise]), np.stack([run.disturbance for run in noise]), FS, 0.005, runs=True
-    )
-    line = _line(ax, "KF-OPC")
-    rows = np.round(line.get_xdata() * FS).astype(int) - 1
-    np.testing.assert_array_equal(line.get_ydata(), curve[rows])
+    e, d = (np.stack([getattr(run, name) for run in noise]) for name in ("error", "disturbance"))
+    rows = require_nse(ax, "KF-OPC", e, d, 0.005, runs=True)
     assert np.max(np.diff(rows)) <= 20  # a quarter of the window
     assert ax.get_ylabel() == "Normalised squared error (dB)\nover 5 ms"
     log = plotting.plot_nse({"KF-OPC": noise}, time_axis="log")
@@ -133,8 +137,7 @@ def test_the_window_of_the_nse_is_said_and_its_values_are_those_of_the_run(noise
     run, short = noise[0], multichannel_result()  # of 1.2 s and of 0.25 s
     ax = plotting.plot_nse({"short": short, "long": run})
     assert ax.get_ylabel() == "Normalised squared error (dB)\nover 20 ms"
-    line, curve = _line(ax, "long"), nse_db(run.error, run.disturbance, FS, 0.02)
-    np.testing.assert_array_equal(line.get_ydata(), curve[np.round(line.get_xdata() * FS).astype(int) - 1])
+    require_nse(ax, "long", run.error, run.disturbance, 0.02)
     assert plotting.plot_nse(run, time_axis="log").get_ylabel().endswith("over 5 ms")
 
 
@@ -192,9 +195,7 @@ def test_a_run_draws_its_error_its_power_and_its_spectra(tonal, kind):
     figure.canvas.draw()
     level, power, spectra = figure.axes
     first = (run.error[0], run.disturbance[0]) if "several" in kind else (run.error, run.disturbance)
-    line = next(line for line in level.get_lines() if line.get_label().startswith(run.algorithm))
-    rows = np.round(line.get_xdata() * FS).astype(int) - 1
-    np.testing.assert_array_equal(line.get_ydata(), nse_db(*first, FS)[rows])
+    require_nse(level, next(label for label in _labels(level) if label.startswith(run.algorithm)), *first)
     assert [ax.get_xlabel() for ax in figure.axes] == ["Time (s)", "Time (s)", "Frequency (Hz)"]
     ratings = [label for label in _labels(power) if label.startswith("Rated")]
     assert ratings == {"several ratings": ["Rated power 0.5", "Rated power 1"], "diverged": []}.get(
@@ -210,10 +211,8 @@ def test_a_run_draws_its_error_its_power_and_its_spectra(tonal, kind):
 def test_nse_of_several_microphones_is_of_all_or_of_one():
     run = multichannel_result()
     together, one = plotting.plot_nse(run), plotting.plot_nse(run, channel=1)
-    for ax, e, d in ((together, run.error, run.disturbance), (one, run.error[1], run.disturbance[1])):
-        line = _line(ax, "KF-OPC")
-        rows = np.round(line.get_xdata() * FS).astype(int) - 1
-        np.testing.assert_array_equal(line.get_ydata(), nse_db(e, d, FS)[rows])
+    require_nse(together, "KF-OPC", run.error, run.disturbance)
+    require_nse(one, "KF-OPC", run.error[1], run.disturbance[1])
     pooled = plotting.plot_nse({"KF-OPC": [run, multichannel_result(seed=1)]}, channel=2)
     assert _labels(pooled) == ["KF-OPC"]
 

@@ -5,14 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kfopc_filterpy import (
-    HardClipAmplifier,
-    LinearAmplifier,
-    Plant,
-    SoftSaturationAmplifier,
-    fx_lms,
-    simulate,
-)
+from kfopc_filterpy import HardClipAmplifier, LinearAmplifier, Plant, SoftSaturationAmplifier, fx_lms, simulate
 from kfopc_filterpy.power.amplifiers import compiled_model
 
 signals = st.floats(-1e9, 1e9)

@@ -95,14 +95,7 @@ MAKERS: dict[str, Any] = {
 }
 
 
-def controlled(
-    controller: Any,
-    *,
-    x: Any = NOISE,
-    secondary: Any = S,
-    disturbance: Any = None,
-    **changed: Any,
-) -> Any:
+def controlled(controller: Any, *, x: Any = NOISE, secondary: Any = S, disturbance: Any = None, **changed: Any) -> Any:
     """Return supervisor, errors and disturbances of a run to the end of the noise."""
     plant = Plant(secondary, PRIMARY if disturbance is None else None, fs=FS)
     interface = SimulatedInterface(x, plant, disturbance=disturbance, block=BLOCK, latency=BLOCK)
