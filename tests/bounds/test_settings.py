@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.channels import delayed, dense_systems
-from helpers.settings_grid import FS, NOISES, compare
 
 from comparisons.bench.noises import bursty_noise
 from comparisons.studies.cases import modelled_plants
-from kfopc_filterpy import Plant, kf_anc, simulate, suggest_settings
-from kfopc_filterpy.bounds import settings
-from kfopc_filterpy.signals import tone
+from kfopc_filterpy import Plant, kf_anc, kf_opc, simulate, suggest_settings
+from kfopc_filterpy.bounds import settings, wiener_solution
+from kfopc_filterpy.signals import band_limited_noise, compressor_noise, scaled_to_power, tone
 
+FS = 16000.0
 S = np.array([0.0, 0.0, 0.8, 0.3])
 PLANT = Plant(S, fs=FS)
 
@@ -217,18 +219,64 @@ def test_the_shortest_record_and_the_longest_filter_that_it_supports():
 
 # ---- How good they are: within 0.5 dB of the best of a grid over length and state noise
 
+ON, DURATION_S = 8000, 2.0  # samples until the control is switched on: the start-up of the primary path is over
+SENSOR_NOISE = 0.01  # standard deviation of the microphone's noise over that of the disturbance
+RATED_SHARE = 0.25  # rated power of KF-OPC over what the best fixed filter takes
+NOISES = {
+    "white": lambda seconds, seed: np.random.default_rng(seed).standard_normal(round(seconds * FS)),
+    "band noise": lambda seconds, seed: band_limited_noise((100, 1000), seconds, fs=FS, rng=seed),
+    "tone": lambda seconds, seed: tone(300.0, seconds, fs=FS, phase_rad=float(seed)),
+    "compressor": lambda seconds, seed: compressor_noise(seconds, fs=FS, rng=seed),
+    "bursts": lambda seconds, seed: bursty_noise(seconds, fs=FS, rng=seed),
+}
+
+
+def noisy_scene(plant, noise, seed):
+    """Return a reference of power 1, and the plant with the noise of its microphone."""
+    x = scaled_to_power(noise(DURATION_S + ON / FS, seed), 1.0)
+    std = SENSOR_NOISE * float(np.sqrt(np.mean(plant.disturbance(x) ** 2)))
+    return x, Plant(plant.secondary, plant.primary, fs=FS, sensor_noise_std=std)
+
 
 @pytest.mark.parametrize(
     ("path", "noise"),
     [
-        ("band-pass", "white"),
-        ("band-pass", "tone"),
-        ("band-pass", "bursts"),
-        ("duct", "band noise"),
-        ("duct", "compressor"),
+        *(("band-pass", noise) for noise in ("white", "tone", "bursts")),
+        *(("duct", noise) for noise in ("band noise", "compressor")),
     ],
 )
+@pytest.mark.filterwarnings("ignore::numpy.exceptions.RankWarning")
 def test_no_setting_of_a_grid_is_better_by_half_a_decibel(path, noise):
-    found = compare(modelled_plants()[path], NOISES[noise], duration=2.0, lengths=(64, 128), factors=(0.01, 1.0, 100.0))
-    assert np.all(found.own > found.best - 0.5), f"{found.own} against {found.best}"
-    assert np.all(found.own[0] > 5.0)  # there is something to lose
+    """Suggested from one run of the noise, compared on another: noise reduction and mean NSE of KF-ANC and KF-OPC.
+
+    The grid has two lengths, each with its suggested q and P0, and multiples of its suggested r. A setting with which
+    KF-OPC exceeds the rated power, and the power with the suggested ones, by 2 % is not counted: while the level changes,
+    weights that lag behind the factor reduce more noise, with power that they should not take.
+    """
+    plant, lengths = modelled_plants()[path], (64, 128)
+    silent, with_noise = noisy_scene(plant, NOISES[noise], 1)
+    d = with_noise.disturbance(silent)[ON:]
+    d = d + with_noise.sensor_noise_std * np.random.default_rng(5).standard_normal(d.size)
+    heard = silent[ON:]
+    suggested = suggest_settings(heard, plant, disturbance=d, max_taps=max(lengths))
+    fixed = wiener_solution(heard, plant, n_taps=suggested.n_taps, disturbance=d, regularization=1e-6)
+    rated = RATED_SHARE * fixed.control_power
+    x, noisy = noisy_scene(plant, NOISES[noise], 2)
+
+    def run(n_taps, noises):
+        both = kf_anc(n_taps, plant, **noises), kf_opc(n_taps, plant, rated_power=rated, **noises)
+        results = simulate(both, x, noisy, rng=6, switch_on_s=ON / FS)
+        merits = [(one.noise_reduction_db, -np.mean(one.nse_db(0.05))) for one in results]
+        return np.array(merits), results[1].output_power
+
+    own, power = run(suggested.n_taps, suggested.noises)
+    best = np.full((2, 2), -np.inf)
+    for n_taps in lengths:
+        at = suggest_settings(heard, plant, disturbance=d, n_taps=n_taps)
+        for factor in (0.01, 1.0, 100.0):
+            merits, used = run(n_taps, replace(at, state_noise=factor * at.state_noise).noises)
+            best[0] = np.maximum(best[0], merits[0])
+            if used <= 1.02 * max(power, rated):
+                best[1] = np.maximum(best[1], merits[1])
+    assert np.all(own > best - 0.5), f"{own} against {best}"
+    assert np.all(own[0] > 5.0)  # there is something to lose

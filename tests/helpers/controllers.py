@@ -174,28 +174,18 @@ class OwnController:
         vars(self).update(state)
 
 
-def _filterpys(kind: type = KalmanFilter, **settings: Any) -> Any:
-    kf = kind(N_TAPS, 1)
-    kf.P, kf.Q, kf.R = P0 * np.eye(N_TAPS), R * np.eye(N_TAPS), Q * np.eye(1)
-    for name, value in settings.items():
-        setattr(kf, name, value)
-    return kf
+def _with(made: Any, **attributes: Any) -> Any:
+    for name, value in attributes.items():
+        setattr(made, name, value)
+    return made
 
 
-def _full(**settings: Any) -> Any:
-    kf = KFOPC(N_TAPS, **settings)
-    kf.P, kf.Q, kf.R = P0 * np.eye(N_TAPS), R * np.eye(N_TAPS), Q * np.eye(1)
-    return kf
-
-
-def _faded(kf: Any) -> Any:
-    kf.alpha = 1.001
-    return kf
+def _full(kind: type = KFOPC, **settings: Any) -> Any:
+    return _with(kind(N_TAPS, 1, **settings), P=P0 * np.eye(N_TAPS), Q=R * np.eye(N_TAPS), R=Q * np.eye(1))
 
 
 def _guarded(controller: Any) -> Any:
-    controller.secondary_path_uncertainty = PathTolerance(delay_samples=0.5, gain_db=1.0)
-    return controller
+    return _with(controller, secondary_path_uncertainty=PathTolerance(delay_samples=0.5, gain_db=1.0))
 
 
 def _observer() -> KalmanObserver:
@@ -207,11 +197,15 @@ def _observer() -> KalmanObserver:
 
 
 AROUND: dict[str, Any] = {
-    "filterpy's filter": lambda: KalmanController(_filterpys(), S_HAT),
-    "filterpy's filter, pinv": lambda: KalmanController(_filterpys(inv=np.linalg.pinv, alpha=1.001), S_HAT),
-    "a user's filter": lambda: KalmanController(_filterpys(OwnFilter), S_HAT),
+    "filterpy's filter": lambda: KalmanController(_full(KalmanFilter), S_HAT),
+    "filterpy's filter, pinv": lambda: KalmanController(
+        _with(_full(KalmanFilter), inv=np.linalg.pinv, alpha=1.001), S_HAT
+    ),
+    "a user's filter": lambda: KalmanController(_full(OwnFilter), S_HAT),
     "KFOPC": lambda: KalmanController(_full(constraint=constraint()), S_HAT),
-    "fading memory": lambda: KalmanController(_faded(KFOPC.random_walk(N_TAPS, **KALMAN)), S_HAT, name="faded"),
+    "fading memory": lambda: KalmanController(
+        _with(KFOPC.random_walk(N_TAPS, **KALMAN), alpha=1.001), S_HAT, name="faded"
+    ),
     "KF-PB, exact path": lambda: short_blocks(N_TAPS, S_HAT, rated_power=0.3, secondary_path_uncertainty=None),
     "guarded KF-OPC": lambda: _guarded(kf_opc(N_TAPS, S_HAT, constraint=constraint(), **KALMAN)),
     "guarded FxLMS": lambda: _guarded(fx_lms(N_TAPS, S_HAT, step_size=MU)),

@@ -124,16 +124,6 @@ def program(
     (folder / "algorithms.h").write_text(f"{table} = {{{rows}, {{0}}}};\n")
     made = folder / name
     files = building.core_sources() if sources is None else sources
-    include = (f"-I{folder}", f"-I{FOLDER}")
-    ran(
-        *command,
-        *program_flags(command, **of_flags),
-        *options,
-        *include,
-        FOLDER / f"{name}.c",
-        *files,
-        "-o",
-        made,
-        "-lm",
-    )
+    flags = (*program_flags(command, **of_flags), *options, f"-I{folder}", f"-I{FOLDER}")
+    ran(*command, *flags, FOLDER / f"{name}.c", *files, "-o", made, "-lm")
     return made

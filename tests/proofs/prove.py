@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import resource
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -22,16 +23,9 @@ HERE = Path(__file__).resolve().parent
 CORE = HERE.parents[1] / "kfopc_filterpy" / "core"
 MACHINE = ("-machdep", "gcc_x86_64")
 MOST_S, MOST_BYTES = 300, 8 << 30  # of a job: CPU time and memory
-EVA = (
-    "-eva",
-    "-warn-special-float",
-    "none",
-    "-eva-mlevel",
-    "99",
-    "-eva-widening-delay",
-    "9",
-    "-eva-no-alloc-returns-null",
-    "-eva-warn-signed-converted-downcast",
+EVA = shlex.split(
+    "-eva -warn-special-float none -eva-mlevel 99 -eva-widening-delay 9 -eva-no-alloc-returns-null "
+    "-eva-warn-signed-converted-downcast"
 )
 # A controller's block is opened field by field, and its rows are followed one by one, so what finds them is followed exactly.
 EXACTLY = {
@@ -128,16 +122,8 @@ def controller(
 ) -> Callable[[], list[str]]:
     """Return a job: what Eva finds in a controller that runs for ever, if each field of its block is memory of its own."""
     followed = ",".join(f"{name}:{count}" for name, count in (EXACTLY | dict(exactly)).items())
-    options = (
-        "-eva-slevel",
-        0,
-        "-eva-split-return",
-        "full",
-        "-eva-auto-loop-unroll",
-        200,
-        "-eva-slevel-function",
-        followed,
-    )
+    given = shlex.split("-eva-slevel 0 -eva-split-return full -eva-auto-loop-unroll 200 -eva-slevel-function")
+    options = (*given, followed)
     shape |= {"algorithm": f"anc_{algorithm}", "settings": settings}
     return lambda: alarms("controller_runs.c", (*COMMON, *sources), options, changes=(*OWN_MEMORY, *changes), **shape)
 
