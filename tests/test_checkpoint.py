@@ -20,6 +20,7 @@ from filterpy.common import inv_diagonal
 from helpers.checkpoints import Measurements, Room, assert_same_contents, forged, sealed
 from helpers.controllers import ALL, FILTERS, OWN, OwnController
 from helpers.loop import S_HAT
+from helpers.simulation import Playing
 
 from kfopc_filterpy import KFOPC, LimitedController, OutputLimiter, fx_lms, kf_opc
 from kfopc_filterpy.checkpoint import Checkpointed, content_of
@@ -153,20 +154,10 @@ def test_a_users_subclass_is_loaded_by_its_own_load_or_if_it_is_passed(tmp_path:
         Mine.load(path)
 
 
-class NoState:
-    """A controller of a user who did not read how it can be saved."""
-
-    def control_signal(self, reference: float) -> float:
-        return reference
-
-    def update(self, error: float) -> None:
-        pass
-
-
 UNSAVED: dict[str, tuple[Any, str]] = {
     "a user's controller": (
-        lambda: LimitedController(NoState(), OutputLimiter(1.0, fs=8000)),
-        "LimitedController.controller cannot be saved: a NoState is neither data nor of a class with the methods state",
+        lambda: LimitedController(Playing(float), OutputLimiter(1.0, fs=8000)),
+        "LimitedController.controller cannot be saved: a Playing is neither data nor of a class with the methods state",
     ),
     "an amplifier": (
         lambda: FeedbackNeutralizer(Mine(), [0.0, 0.1], amplifier=lambda y: y),

@@ -75,17 +75,9 @@ def test_rows_are_what_plain_runs_give(small: Any) -> None:
 
 
 def rows_of(name: str, reductions: Any, powers: Any = (1.0, 1.0), seed: int = 1) -> list[BudgetRow]:
+    place: Any = {"path": CASE.path, "noise": CASE.noise, "seed": seed, "algorithm": name, "worst_window": 2.0}
     return [
-        BudgetRow(
-            path=CASE.path,
-            noise=CASE.noise,
-            share_db=share,
-            seed=seed,
-            algorithm=name,
-            noise_reduction_db=reduction,
-            power=power,
-            worst_window=2.0,
-        )
+        BudgetRow(share_db=share, noise_reduction_db=reduction, power=power, **place)
         for share, reduction, power in zip(SHARES, reductions, powers, strict=True)
     ]
 

@@ -8,6 +8,7 @@ import control
 import numpy as np
 import pytest
 from helpers.channels import random_paths, through
+from helpers.simulation import Playing
 
 from kfopc_filterpy import Plant, fx_lms, kf_pb, noise_reduction_db, simulate
 from kfopc_filterpy.bounds import predictor_reference
@@ -48,13 +49,8 @@ def run(controller: Any, **options: Any) -> Any:
     return simulate(controller, noise(), Plant(SECONDARY, primary(), fs=FS), **options)
 
 
-class Silent:
-    """A controller of a user, which plays nothing."""
-
-    def control_signal(self, reference: Any) -> Any:
-        return np.zeros(1)
-
-    def update(self, error: Any) -> None: ...
+def silent() -> Playing:
+    return Playing(lambda _: np.zeros(1))
 
 
 # ---- The wrapper
@@ -110,12 +106,12 @@ def test_with_an_internal_model_the_noise_at_the_virtual_places_is_the_reference
 def test_one_filter_of_one_tap_and_the_default_of_the_virtual_ones() -> None:
     """And `ObservationFilters` in place of an array."""
     filters = ObservationFilters(np.array([[[0.5]]]), np.zeros(1))
-    controller = VirtualMicrophones(Silent(), SECONDARY[:2, :1], filters, physical=[1])
+    controller = VirtualMicrophones(silent(), SECONDARY[:2, :1], filters, physical=[1])
     assert controller.virtual.tolist() == [0]
     controller.control_signal([1.0])
     controller.update([np.nan, 4.0])  # the virtual one is not read
     assert controller.virtual_error.tolist() == [2.0]
-    assert repr(controller) == "<Silent with virtual microphones: 1 physical, 1 virtual>"
+    assert repr(controller) == "<Playing with virtual microphones: 1 physical, 1 virtual>"
 
 
 # ---- The Kalman form
@@ -209,6 +205,6 @@ def test_a_run_at_another_rate_is_refused() -> None:
     with pytest.raises(ValueError, match="power memory is for 4000 Hz"):
         simulate(controller, noise(), Plant(paths, fs=2 * FS), disturbance=np.zeros((2, 1500)))
     observer = KalmanObserver(random_model(False)[:2, :2], 1, sensor_noise_std=0.1)
-    controller = VirtualMicrophones(Silent(), paths, observer, physical=[0])
+    controller = VirtualMicrophones(silent(), paths, observer, physical=[0])
     with pytest.raises(ValueError, match="observer is for 4000 Hz"):
         simulate(controller, noise(), Plant(paths, fs=2 * FS), disturbance=np.zeros((2, 1500)))

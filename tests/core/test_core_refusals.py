@@ -102,17 +102,16 @@ def test_settings_are_in_the_order_of_the_c_file() -> None:
 
 def test_a_setting_without_an_upper_limit_may_be_large() -> None:
     limited = {"modified", "fading", "block", "averaging", "window", "memory", "spread"}
+
+    def block(name: str, **changed: float) -> Block:
+        return Block(Algorithm(name), Shape(1, 1, 1, 8, 1), path=np.ones(1), settings={**ALGORITHMS[name], **changed})
+
     for name, own in ALGORITHMS.items():
         for setting in own.keys() - limited:
-            Block(Algorithm(name), Shape(1, 1, 1, 8, 1), path=np.ones(1), settings=dict(own) | {setting: 1e6})
+            block(name, **{setting: 1e6})
     for name in ("mov", "mov_fixed"):
         with pytest.raises(ValueError, match="modified"):
-            Block(
-                Algorithm(name),
-                Shape(1, 1, 1, 8, 1),
-                path=np.ones(1),
-                settings=dict(ALGORITHMS[name]) | {"modified": 2.0},
-            )
+            block(name, modified=2.0)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.util import resolve_name
 from pathlib import Path
 
 import pytest
@@ -36,19 +37,13 @@ def layer_of_public_names() -> dict[str, str]:
 def imported(path: Path) -> Iterator[str]:
     """Folders and modules of the package that a module imports from, within functions and for types too."""
     public = layer_of_public_names()
-    package = path.relative_to(PACKAGE).parts[:-1]
+    package = ".".join(path.relative_to(ROOT).parts[:-1])
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if not isinstance(node, ast.ImportFrom):
-            continue
-        parts = tuple((node.module or "").split(".")) if node.module else ()
-        if node.level:
-            parts = package[: len(package) - node.level + 1] + parts
-        elif parts[:1] == ("kfopc_filterpy",):
-            parts = parts[1:]
-        else:
-            continue
-        names = [alias.name for alias in node.names if alias.name != "__version__"]  # which is the package's own
-        yield from [parts[0]] if parts else (public.get(name, name) for name in names)
+        if isinstance(node, ast.ImportFrom):
+            top, *parts = resolve_name("." * node.level + (node.module or ""), package).split(".")
+            names = [alias.name for alias in node.names if alias.name != "__version__"]  # which is the package's own
+            if top == "kfopc_filterpy":
+                yield from parts[:1] or (public.get(name, name) for name in names)
 
 
 def test_the_list_has_every_folder_and_module_of_the_package_once():

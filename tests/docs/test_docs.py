@@ -23,7 +23,6 @@ import source_lines  # noqa: E402
 PAGES = sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts)
 LINE_ROLE = re.compile(r"\{line\}`([^`]+)`")
 PUBLIC = [(name, public_names.thing_of(name)) for name in public_names.public_names()]
-NAMES = [name for name, _ in PUBLIC]
 BUILT_OTHERWISE = (tuple, Exception)  # named tuples and errors: made by the package, not by its users
 
 

@@ -19,12 +19,6 @@ def through(paths: np.ndarray, signals: np.ndarray) -> np.ndarray:
     return np.array([sum(np.convolve(p, s)[:n_samples] for p, s in zip(row, signals, strict=True)) for row in paths])
 
 
-def correlation(signals: np.ndarray, lags: int) -> np.ndarray:
-    """E[x_i(n - m) x_k(n)] at [m, i, k], the biased estimate."""
-    n_samples = signals.shape[1]
-    return np.array([signals[:, : n_samples - m] @ signals[:, m:].T for m in range(lags)]) / n_samples
-
-
 def delayed(signals: np.ndarray, taps: int) -> np.ndarray:
     """Each signal delayed by 0 to taps - 1 samples, (signals * taps, n)."""
     return np.array([np.concatenate([np.zeros(m), s[: s.size - m]]) for s in signals for m in range(taps)])

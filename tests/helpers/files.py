@@ -64,13 +64,7 @@ def _text(path: Path) -> None:
 
 
 def _timed(path: Path) -> None:
-    np.savetxt(
-        path,
-        np.column_stack([np.arange(signal().size) / FS, signal()]),
-        fmt=["%.7f", "%.17g"],
-        delimiter=";",
-        header="t;p",
-    )
+    np.savetxt(path, np.column_stack([np.arange(signal().size) / FS, signal()]), fmt="%.7f;%.17g", header="t;p")
 
 
 def rew_text(taps: np.ndarray, *, fs: float = FS, start_s: float = 0.0, changes: tuple[str, str] = ("", "")) -> str:

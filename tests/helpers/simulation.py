@@ -50,6 +50,16 @@ class Integrator:
         self.gain += 0.05 * error * self.x
 
 
+class Playing:
+    """A user's own controller that plays what a function makes of the reference, and does not adapt."""
+
+    def __init__(self, play):
+        self.control_signal = play
+
+    def update(self, error):
+        pass
+
+
 class Stepwise:
     """A controller whose two methods Python calls for each sample: the loop cannot see that it is one of the core."""
 

@@ -136,10 +136,7 @@ def test_no_share_of_a_tolerance_makes_a_frequency_louder_by_more_than_3_db(phas
 @pytest.mark.parametrize(
     "tolerance",
     [
-        PathTolerance(0.5),
-        PathTolerance(1.0),
-        PathTolerance(2.0),
-        PathTolerance(8.0),
+        *map(PathTolerance, (0.5, 1.0, 2.0, 8.0)),
         PathTolerance(1.0, 20.0, 2.0),
         PathTolerance(1.0, gain_db=12.0),
         PathTolerance(phase_deg=130.0, gain_db=20.0),

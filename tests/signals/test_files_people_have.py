@@ -355,6 +355,7 @@ STATED = [
     ("empty.csv", ",0.1,0.5\n,0.2,1\n,0.0,7\n", {"fs": 8000}, (8000, "1", [[0.1, 0.2, 0], [0.5, 1, 7]])),
     ("fortran.txt", " 1.0D-03\n -2.D+00\n", {"fs": 8000}, (8000, "1", [0.001, -2])),
     ("rows.txt", "1 2 3\n4 5 6\n7 8\n", {"fs": 8000}, "number of columns changed from 3 to 2 at row 3"),
+    ("end.txt", "1\n2\nstopped by user\n", {"fs": 8000}, r"end\.txt is damaged or cut short, .* columns changed from 1 to 3 at row 3"),
     ("square.npy", lambda path: np.save(path, np.eye(4)), {"fs": 8000}, r"\(4, 4\): which axis is time"),
     ("t.npy", lambda path: np.save(path, np.c_[TIMES, SIGNAL]), {}, (FS, "1", signal()[:2])),
     ("t.mat", lambda path: scipy.io.savemat(path, {"to_file": np.c_[TIMES, SIGNAL].T}), {}, (FS, "1", signal()[:2])),
