@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import count
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers.simulation import Playing
 from helpers.studies import run_study, smaller
 
 from comparisons.bench import StudyReport
 from comparisons.studies import uncertain_path
 from comparisons.studies.uncertain_path import DEFAULT, IDENTIFIED, NOTHING, STATED, AllowanceRow, seconds_db
-from kfopc_filterpy import Plant, SimulationResult, simulate
+from kfopc_filterpy import Plant, simulate
 
 PLANT = Plant([0.0, 0.0, 0.0, 1.0, -0.6], [0.0] * 8 + [0.8, 0.4], fs=16000)
 
@@ -44,22 +46,10 @@ def test_the_identified_path_is_near_the_true_one_and_within_its_uncertainty() -
 
 def test_each_second_counts_by_itself() -> None:
     x = np.ones(35)
-    result: SimulationResult = simulate(_Half(), x, Plant([1.0], fs=10), disturbance=x)
+    numbers = count()  # half of the reference is played until two seconds are over
+    half = Playing(lambda reference: 0.5 * reference if next(numbers) < 20 else 0.0)
+    result = simulate(half, x, Plant([1.0], fs=10), disturbance=x)
     assert seconds_db(result) == pytest.approx([20 * np.log10(2.0)] * 2 + [0.0])
-
-
-class _Half:
-    """Plays half of the reference until it has heard two seconds."""
-
-    def __init__(self) -> None:
-        self.n = 0
-
-    def control_signal(self, reference: float) -> float:
-        self.n += 1
-        return 0.5 * reference if self.n <= 20 else 0.0
-
-    def update(self, error: float) -> None:
-        pass
 
 
 def test_claims_from_rows_made_by_hand() -> None:

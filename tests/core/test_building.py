@@ -54,29 +54,18 @@ def only_line(failed: subprocess.CompletedProcess[str]) -> str:
 # Loading.
 
 
-def edit_sources(core: Path) -> None:
-    with (core / "lms.c").open("a") as file:
-        file.write("/* edited */\n")
-
-
-def delete_libraries(core: Path) -> None:
-    for path in core.glob("libanc-*"):
-        path.unlink()
-
-
-def spoil_library(core: Path) -> None:
-    (core / building.library_name("double", "baseline")).write_bytes(b"not a library")
+BASELINE = building.library_name("double", "baseline")
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (edit_sources, "was built from other sources"),
-        (delete_libraries, "is not built"),
-        (spoil_library, "does not load"),
+        (lambda core: (core / "lms.c").write_text("/* edited */\n"), "was built from other sources"),
+        (lambda core: [path.unlink() for path in core.glob("libanc-*")], "is not built"),
+        (lambda core: (core / BASELINE).write_bytes(b"not a library"), "does not load"),
     ],
 )
-def test_a_library_that_cannot_be_used_is_reported(change: Callable[[Path], None], says: str, copied: Path) -> None:
+def test_a_library_that_cannot_be_used_is_reported(change: Callable[[Path], object], says: str, copied: Path) -> None:
     assert loaded(copied).returncode == 0
     change(copied)
     message = only_line(loaded(copied))

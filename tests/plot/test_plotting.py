@@ -243,25 +243,10 @@ def test_output_power_has_a_curve_for_each_loudspeaker():
     np.testing.assert_array_equal(_line(one, "KF-OPC").get_ydata(), ax.get_lines()[1].get_ydata())
 
 
-def test_channels_that_are_missing_or_not_there_are_refused():
-    many = multichannel_result()
-    span = {"span_s": (0.1, 0.12)}
-    others = {"a": [many, multichannel_result(control_signal=np.zeros(4000))]}
-    for plot, results, options, message in (
-        (plotting.plot_anti_noise, many, span, "results hold 3 channels; choose one with channel=0 to channel=2"),
-        (plotting.plot_amplifier_output, many, span, "results hold 2 channels; choose one"),
-        (plotting.plot_nse, many, {"channel": 3}, r"channel must be below the 3 channel\(s\) of the results, got 3"),
-        (plotting.plot_output_power, many, {"channel": 2}, r"channel must be below the 2 channel\(s\) of the results"),
-        (plotting.plot_nse, others, {}, "with the same channels"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            plot(results, **options)
-    assert not plt.get_fignums()
-
-
 def test_refusals_name_the_argument(tonal, noise):
-    run = tonal["KF-OPC"]
+    run, many = tonal["KF-OPC"], multichannel_result()
     span = {"span_s": SPAN}
+    others = {"a": [many, multichannel_result(control_signal=np.zeros(4000))]}
     for plot, results, options, message in (
         (plotting.plot_nse, run.error, {}, "results must be a SimulationResult or a sequence of them, got ndarray"),
         (plotting.plot_nse, {"a": run.error}, {}, "results must hold SimulationResult, got ndarray under 'a'"),
@@ -274,6 +259,16 @@ def test_refusals_name_the_argument(tonal, noise):
         (plotting.plot_anti_noise, run, {"span_s": 0.1}, r"span_s must be a pair \(start, end\) in seconds"),
         (plotting.plot_nse, run, {"time_axis": "decades"}, "time_axis must be one of 'linear', 'log'"),
         (plotting.plot_output_power, run, {"rated_power": 0.0}, "rated_power must be greater than 0"),
+        (
+            plotting.plot_anti_noise,
+            many,
+            {"span_s": (0.1, 0.12)},
+            "results hold 3 channels; choose one with channel=0 to channel=2",
+        ),
+        (plotting.plot_amplifier_output, many, {"span_s": (0.1, 0.12)}, "results hold 2 channels; choose one"),
+        (plotting.plot_nse, many, {"channel": 3}, r"channel must be below the 3 channel\(s\) of the results, got 3"),
+        (plotting.plot_output_power, many, {"channel": 2}, r"channel must be below the 2 channel\(s\) of the results"),
+        (plotting.plot_nse, others, {}, "with the same channels"),
     ):
         with pytest.raises((TypeError, ValueError), match=message):
             plot(results, **options)
