@@ -201,22 +201,3 @@ def test_a_file_of_very_many_variables_is_refused_at_once(tmp_path):
     with pytest.raises(ValueError, match="and 980 more; choose one") as refused:
         read_recording(tmp_path / "x.npz", file_fs=FS)
     assert len(str(refused.value)) < 1000
-
-
-def test_text_that_ends_within_a_number_is_refused(tmp_path):
-    lines = [f"{abs(value):.9f}" for value in signal(1, 200)]
-    for cut in (1, 5, 9):
-        (tmp_path / "x.txt").write_text("\n".join(lines)[:-cut])
-        with pytest.raises(ValueError, match="ends within a line"):
-            read_recording(tmp_path / "x.txt", file_fs=FS)
-    for end in ("", "\n"):
-        (tmp_path / "x.txt").write_text("\n".join(lines) + end)
-        assert read_recording(tmp_path / "x.txt", file_fs=FS).samples.size == 200
-
-
-def test_a_number_behind_a_hash_is_no_comment(tmp_path):
-    (tmp_path / "x.txt").write_text("1.5\n2.5\n#3\n4.5\n")
-    with pytest.raises(ValueError, match="'#3' among its numbers"):
-        read_recording(tmp_path / "x.txt", file_fs=FS)
-    (tmp_path / "x.txt").write_text("1.5\n2.5\n# a door\n4.5\n")
-    assert read_recording(tmp_path / "x.txt", file_fs=FS).samples.tolist() == [1.5, 2.5, 4.5]

@@ -304,6 +304,10 @@ def variables(**beside):
     return lambda path: scipy.io.savemat(path, {"p": SIGNAL, **beside})
 
 
+def a_file(content):
+    return lambda path: path.write_bytes(content)
+
+
 def a_wav(samples, bits, block, **options):
     return lambda path: path.write_bytes(wav(np.ascontiguousarray(samples), bits, block, **options))
 
@@ -316,6 +320,7 @@ def two_units(path):
     np.savez(path, p=np.c_[SIGNAL, SIGNAL], units=["mPa", "V"], fs=FS)
 
 
+DIGITS = "\n".join(f"{abs(value):.9f}" for value in signal())
 # A file's name; its text, or what writes it; how it is asked for; its rate, unit and first samples, or the error.
 STATED = [
     ("rate.txt", "Sample Rate: 48000 Hz. Linear scale\n0.5\n1\n", {"fs": 48000}, (48000, "1", [0.5, 1])),
@@ -355,6 +360,13 @@ STATED = [
     ("empty.csv", ",0.1,0.5\n,0.2,1\n,0.0,7\n", {"fs": 8000}, (8000, "1", [[0.1, 0.2, 0], [0.5, 1, 7]])),
     ("fortran.txt", " 1.0D-03\n -2.D+00\n", {"fs": 8000}, (8000, "1", [0.001, -2])),
     ("rows.txt", "1 2 3\n4 5 6\n7 8\n", {"fs": 8000}, "number of columns changed from 3 to 2 at row 3"),
+    ("hash.txt", "1.5\n2.5\n#3\n4.5\n", {"fs": 8000}, "'#3' among its numbers"),
+    ("hash.txt", "1.5\n2.5\n# a door\n4.5\n", {"fs": 8000}, (8000, "1", [1.5, 2.5, 4.5])),
+    *(("cut.txt", DIGITS[:-cut], {"fs": 8000}, "ends within a line") for cut in (1, 5, 9)),
+    *(("whole.txt", DIGITS + end, {"fs": 8000}, (8000, "1", np.round(np.abs(signal()), 9))) for end in ("", "\n")),
+    *((name, a_file(content), {"fs": 8000}, rf"{name} (is text that is no numbers|is neither text nor)")
+      for name in ("x.csv", "x.unknown")
+      for content in (b"Dear Sir or Madam,\nno numbers\n", bytes(range(128, 256)) * 9, b"\n\n\n", b"\0" * 99)),
     ("end.txt", "1\n2\nstopped by user\n", {"fs": 8000}, r"end\.txt is damaged or cut short, .* columns changed from 1 to 3 at row 3"),
     ("square.npy", lambda path: np.save(path, np.eye(4)), {"fs": 8000}, r"\(4, 4\): which axis is time"),
     ("t.npy", lambda path: np.save(path, np.c_[TIMES, SIGNAL]), {}, (FS, "1", signal()[:2])),

@@ -301,16 +301,6 @@ def test_nan_is_refused_with_its_place_and_only_in_the_channel_that_is_read(tmp_
         assert read_recording(tmp_path / name, channel=1, fs=FS).samples.tolist() == [0.0, 0.0, 1.0]
 
 
-@pytest.mark.parametrize("name", ["x.csv", "x.unknown"])
-@pytest.mark.parametrize(
-    "content", [b"Dear Sir or Madam,\nno numbers\n", bytes(range(128, 256)) * 9, b"\n\n\n", b"\0" * 99]
-)
-def test_text_that_is_no_numbers_is_refused(tmp_path, name, content):
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=rf"{name} (is text that is no numbers|is neither text nor)"):
-        read_recording(tmp_path / name, fs=FS)
-
-
 def test_nothing_is_unpickled(tmp_path):
     class Trap:
         def __reduce__(self):
