@@ -1,7 +1,7 @@
 """Files that are written whole: beside their place, forced to the disk, and then renamed.
 
-So the disk may be full, the process killed or a file written onto its own source: what was there before stays, or all
-of the new is there. Files that belong together move to their places once all of them are written.
+Even if the disk is full, the process is killed or a file is written onto its own source, either the old file or the
+whole new one is there. Files that belong together move to their places once all of them are written.
 """
 
 from __future__ import annotations

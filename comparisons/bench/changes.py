@@ -1,4 +1,4 @@
-"""What may become of a noise, of the paths or of a microphone during a run: one list for the study and the benchmark."""
+"""What may change in a noise, a path or a microphone during a run: one list for the study and the benchmark."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _same(signal: np.ndarray, at: int, fs: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Change:
-    """What becomes of each signal and path; by default, nothing."""
+    """How each signal and path changes; by default, nothing does."""
 
     noise: SignalChange = _same  # the noise itself
     reference: SignalChange = _same  # as the reference microphone delivers it

@@ -79,7 +79,7 @@ class Algorithm:
 
     @property
     def sees_budget(self) -> bool:
-        """Whether it is made with the rated power, not tuned to it by a second setting; else its runs serve for all."""
+        """Whether it is made with the rated power, not tuned to it; if not, its runs serve for all rated powers."""
         return self.keeps_budget and not self.second
 
     @property

@@ -171,7 +171,7 @@ class CommandController(PlaysBlocks):
         return True
 
     def _failure(self, what: str) -> EntryFailed:
-        """Return why the command failed; its output has ended, and so it has, or the time of the run ends it."""
+        """Return why the command failed. Its output has ended; it ends too, or is ended when its time is over."""
         status = self._process.wait()
         if self._timed_out:
             return EntryFailed(f"took longer than {self._timeout_s:g} s for a run")

@@ -77,7 +77,7 @@ class Event:
 
 
 class Converted:
-    """A controller behind what a converter makes of a reading at a sample: of the error's, or of the reference's too."""
+    """A controller that gets the error, or the error and the reference, through a converter."""
 
     def __init__(self, controller: Any, convert: Convert, *, both: bool = False) -> None:
         self.controller, self.convert, self.both, self.n = controller, convert, both, 0

@@ -277,8 +277,8 @@ class Correlations:
 class Record:
     """Samples that control filters are fitted to.
 
-    The signals x and x' begin `n_taps` - 1 samples early, to fill the delay lines. Of one channel, x, x' and d are
-    one-dimensional; of several, x is (I, n + n_taps - 1), x' (K, J, I, n + n_taps - 1) and d (K, n).
+    The signals x and x' begin `n_taps` - 1 samples early, to fill the delay lines. With one channel, x, x' and d are
+    one-dimensional; with several, x is (I, n + n_taps - 1), x' (K, J, I, n + n_taps - 1) and d (K, n).
     """
 
     x: np.ndarray
@@ -421,11 +421,11 @@ def reduction_db(error_power: float, disturbance_power: float) -> float:
 
 
 def loss_db(stretch: Record, correlations: Any, weights: np.ndarray, penalty: float = 0.0, ridge: float = 0.0) -> float:
-    """Return by how many dB weights in the directions left out would lower the error, 0 if it does not matter.
+    """Return by how many dB weights in the directions left out would lower the error; 0 if the loss does not matter.
 
-    Of several channels that is not known, and 0 as well. With a penalty or a ridge, the error is that of the penalised
-    problem. The signals themselves resolve weights that their correlations do not: a QR decomposition of evenly spaced
-    samples is compared with `weights` at those samples.
+    With several channels it is not known, and 0 is returned. With a penalty or a ridge, the error is that of the
+    penalised problem. The signals themselves resolve weights that their correlations do not: a QR decomposition of
+    evenly spaced samples is compared with `weights` at those samples.
     """
     from scipy.linalg import lstsq
 

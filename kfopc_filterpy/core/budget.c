@@ -462,16 +462,16 @@ static real power_of_now(const budget *f, const real *v)
 }
 
 /* Return the largest factor on the power of filter v that loudspeaker j's account can afford, if
- * its noise goes on for a time: that of the last block; for longer, that of the window of x, for
- * which v takes `power`; and if a silence has `saved` power, the noise of now for any longer time:
- * else the saved power would be spent at once, and be missing later. */
+ * the noise goes on: that of the last block for a short time, and that of the window of x, for which
+ * v takes `power`, for longer. If a silence has `saved` power, the noise at its present level must
+ * be affordable for even longer: otherwise the saved power would be spent at once, and be missing later. */
 static real affordable(const budget *f, int32_t j, const real *v, real power, real level, int saved)
 {
     const int32_t T = f->T, block = T / BLOCK_LASTS, window = T / WINDOW_LASTS;
     const real rated = f->s.setting[RATED_POWER][j], of_block = power_of_block(f, v);
     const real of_now = power * (level < 1 ? level : 1);
     real spent = 0, factor = 0;
-    for (int32_t n = T - 1; n >= block; n--) { /* spent: and in the account after n blocks, too */
+    for (int32_t n = T - 1; n >= block; n--) { /* spent, and still counted n blocks from now */
         spent += f->book[times(T - 1 - n, f->s.J) + (size_t)j];
         const int longer = saved && n > window && n <= T - window;
         if (!longer && n != window && n != block) continue;
@@ -518,7 +518,7 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
     const real cheaper = larger(1 - CHEAPER * larger(left, 0), CHEAPEST);
     real price = larger(f->steady[j] * cheaper, WORTHWHILE * q / (rated * (real)J));
     const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
-    /* 3 The account must afford it, and for longer if it holds more than the price follows. */
+    /* 3 The account must afford it, for longer if so much is left that the price does not follow. */
     const int saved = CHEAPER * left > 1 - CHEAPEST;
     const real factor = power > 0 ? affordable(f, j, v, power, level, saved) : 1;
     if (factor < 1) price = price_of(&t, factor * power, price, v);
@@ -650,7 +650,7 @@ static int note(budget *f, const real *error, int controlled)
 }
 
 /* Cut clicks from the newest references. A sound that sets in after silence is cut, too, until the
- * peak has grown: nothing is learned from what the delay lines hold of it. */
+ * peak has grown: nothing is learned while cut samples are in the delay lines. */
 static void cut_clicks(budget *f)
 {
     for (int32_t i = 0; i < f->s.I; i++) {

@@ -171,7 +171,7 @@ def require_control(kf: KalmanFilter, u: ArrayLike | None, B: ArrayLike | None) 
 
 
 def with_masks(z: Any) -> Any:
-    """Return a measurement that has None among its components, as a table with gaps gives it, as a masked array."""
+    """Return a measurement as a masked array if None is among its components, as in a table with gaps."""
     has_objects = (
         z.dtype.kind == "O"
         if isinstance(z, np.ndarray)

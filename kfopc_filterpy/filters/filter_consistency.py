@@ -193,7 +193,7 @@ def consistency(
 
 
 def _saved(runs: Any) -> tuple[np.ndarray, ...]:
-    """Return innovations, which are zero where they are missing, which are there, S, x and P of several Savers."""
+    """Return the innovations of several Savers, zero where they are missing, a mask of those there, and S, x and P."""
     if not all(hasattr(run, name) for run in runs for name in ("z", "y", "S", "x", "P")):
         raise TypeError("saver must be a filterpy.common.Saver that has saved each update, or a list of them")
     lengths = {len(run.z) for run in runs}

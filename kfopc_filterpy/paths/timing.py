@@ -12,7 +12,7 @@ _LEAST_PEAK = 100  # times the mean square of a response; of a million samples o
 _LEAST_LEAD = 0.5  # of a response's energy that comes before time 0: the files are swapped
 _SPECTRUM = 4096  # samples of a spectrum's segments at most
 _FLOOR = 1e-3  # of the mean power, added to a spectrum that is divided by
-_FRAMES, _NEAR, _ONCE = 64, 2, 0.8  # of a record; beside the loudest, and of their power: a frequency is played once
+_FRAMES, _NEAR, _ONCE = 64, 2, 0.8  # of a record; frames near the loudest, which have this share if played once
 _LOST = "a block was lost, so record both again in one stream, or cut both there."
 
 
@@ -41,7 +41,7 @@ def timing_fault(sent: np.ndarray, heard: np.ndarray, fs: float, names: tuple[st
 
 
 def plays_once(sent: np.ndarray) -> bool:
-    """Return whether each frequency is played at one time, and not all at the same, as by a single sweep.
+    """Return whether each frequency is played once, and not all of them at the same time, as in a single sweep.
 
     Then clocks that differ and lost samples cannot be told from a path that delays some frequencies more than others.
     """

@@ -76,8 +76,9 @@ def one_channel(signal: np.ndarray, channel: int | None) -> np.ndarray:
 def named_styles(labels: list[str], algorithms: list[str]) -> list[dict[str, Any]]:
     """Return the styles of curves, each with a colour of its own while there are enough.
 
-    The label's style comes first, if it is an algorithm, then the algorithm's; a curve that finds both taken gets one of
-    the other colours. A solid line is wide and beneath the others, so that curves that coincide are both seen.
+    A curve gets the style of its label if that names an algorithm, otherwise that of its algorithm. If these are taken,
+    it gets one of the other colours. A solid line is wide and beneath the others, so that curves that coincide are both
+    seen.
     """
     taken: list[dict[str, Any]] = []
     others = [curve_style(i) for i in range(COLOURS)]
