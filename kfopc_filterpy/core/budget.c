@@ -463,8 +463,8 @@ static real power_of_now(const budget *f, const real *v)
 
 /* Return the largest factor on the power of filter v that loudspeaker j's account can afford, if
  * the noise goes on: that of the last block for a short time, and that of the window of x, for which
- * v takes `power`, for longer. If a silence has `saved` power, the noise at its present level must
- * be affordable for even longer: otherwise the saved power would be spent at once, and be missing later. */
+ * v takes `power`, for longer. If a silence has `saved` power, the present level must be affordable
+ * for even longer: otherwise the saved power would be spent at once, and be missing later. */
 static real affordable(const budget *f, int32_t j, const real *v, real power, real level, int saved)
 {
     const int32_t T = f->T, block = T / BLOCK_LASTS, window = T / WINDOW_LASTS;
@@ -518,7 +518,7 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
     const real cheaper = larger(1 - CHEAPER * larger(left, 0), CHEAPEST);
     real price = larger(f->steady[j] * cheaper, WORTHWHILE * q / (rated * (real)J));
     const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
-    /* 3 The account must afford it, for longer if so much is left that the price does not follow. */
+    /* 3 The account must afford it, for longer if more is left than the price follows. */
     const int saved = CHEAPER * left > 1 - CHEAPEST;
     const real factor = power > 0 ? affordable(f, j, v, power, level, saved) : 1;
     if (factor < 1) price = price_of(&t, factor * power, price, v);
