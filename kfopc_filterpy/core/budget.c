@@ -462,9 +462,10 @@ static real power_of_now(const budget *f, const real *v)
 }
 
 /* Return the largest factor on the power of filter v that loudspeaker j's account can afford, if
- * the noise goes on: that of the last block for a short time, and that of the window of x, for which
- * v takes `power`, for longer. If a silence has `saved` power, the present level must be affordable
- * for even longer: otherwise the saved power would be spent at once, and be missing later. */
+ * the noise goes on: that of the last block for a short time, and that of the window of x, for
+ * which v takes `power`, for longer. If a silence has `saved` power, the present level must be
+ * affordable for even longer: otherwise the saved power would be spent at once, and be missing
+ * later. */
 static real affordable(const budget *f, int32_t j, const real *v, real power, real level, int saved)
 {
     const int32_t T = f->T, block = T / BLOCK_LASTS, window = T / WINDOW_LASTS;
