@@ -69,8 +69,8 @@ def identify(options: argparse.Namespace) -> int:
     if plays_once(sent):
         warn(
             options,
-            f"{options.excitation} plays each frequency once, so clocks that differ and lost samples would not show: unless "
-            "one interface plays and records, play noise, or the sweep twice",
+            f"{options.excitation} plays each frequency once, so clocks that differ and lost samples would not show: play "
+            "noise, or the sweep twice, unless one interface plays and records",
         )
     units = files.units[options.response], files.units[options.excitation]
     _write_path(options.output, found.taps, files.fs, "" if "1" in units or len(set(units)) == 1 else "/".join(units))
