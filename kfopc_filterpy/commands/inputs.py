@@ -138,10 +138,11 @@ class Files:
         """Return the channels of a file that its argument names, at a rate."""
         from ..paths.reading import path_of
         from ..signals.content import LEAST_SURE_RATE
-        from ..signals.recordings import as_channel, read_content, recording_of
+        from ..signals.recordings import read_content, recording_of
 
         named = _named(path)
-        content, file_fs = read_content(named.file, variable=named.variable), None
+        content = read_content(named.file, channel=named.channel, variable=named.variable)
+        file_fs = None
         if content.fs is None or content.fs < LEAST_SURE_RATE:
             file_fs, self._without_rate = self.options.file_fs, True
             if file_fs is None and content.fs is None:
@@ -150,11 +151,7 @@ class Files:
                     "--file-fs 48000 (--fs is the rate to which files are resampled)"
                 )
         read = (path_of if is_path else recording_of)(named.file, content, fs, file_fs)
-        samples = read.samples
-        if named.channel is not None:
-            samples = np.atleast_2d(samples)
-            samples = samples[as_channel(named.channel, samples, path, called=f"the channel in {path}")]
-        return replace(read, samples=samples, name=path)
+        return replace(read, name=path)
 
 
 def scene_of(options: argparse.Namespace, files: Files) -> tuple[np.ndarray, Plant, np.ndarray | None]:
@@ -305,7 +302,7 @@ def calibration_of(options: argparse.Namespace, files: Files, n_microphones: int
     if options.disturbance is None and options.primary is not None:
         del stated[errors]  # of the reference
     units = {unit for unit in stated.values() if unit != "1"}
-    if len(units) > 1 or (pascals is not None and units and (units != {"Pa"} or set(pascals) != {1.0})):
+    if len(units) > 1 or (pascals is not None and units == {"Pa"} and set(pascals) != {1.0}):
         is_in = ", ".join(f"{path} is in {files.units[path]}" for path, unit in stated.items() if unit != "1")
         scale = "" if pascals is None else f", but {option} gives {', '.join(f'{one:.4g}' for one in pascals)} Pa for 1"
         raise ValueError(f"{is_in}{scale}: the error microphones need one unit")

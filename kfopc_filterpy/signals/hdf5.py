@@ -56,6 +56,6 @@ def read_mat73(path: str | os.PathLike[str], variable: str | None) -> Content:
             if data.is_virtual or data.external:
                 raise ValueError(f"{name!r} of {path} refers to other files: store its samples in the file itself")
             require_room(path, data.size)
-            return data[()].T if shapes.get(name) != (0,) else np.empty(0)
+            return np.empty(0) if "MATLAB_empty" in data.attrs else data[()].T
 
         return chosen_variable(path, shapes, read, variable, others)

@@ -374,13 +374,13 @@ def _without_time(path: str | os.PathLike[str], content: Content) -> Content:
     return content._replace(samples=timed.samples, fs=fs, start_s=content.start_s or timed.start_s)
 
 
-def as_channel(channel: int, samples: np.ndarray, name: object, *, called: str = "channel") -> int:
-    """Return a channel if samples (n_channels, n_samples) of `name` have it; it is `called` so where it was chosen."""
+def as_channel(channel: int, samples: np.ndarray, name: object) -> int:
+    """Return a channel if samples (n_channels, n_samples) of `name` have it."""
     if samples.ndim > 2:
-        raise ValueError(f"{name} holds a matrix of paths, {samples.shape}, and no channels: leave out {called}")
-    index = as_count(channel, called, minimum=0)
+        raise ValueError(f"{name} holds a matrix of paths, {samples.shape}, and no channels: leave out channel")
+    index = as_count(channel, "channel", minimum=0)
     if index >= len(samples):
-        raise ValueError(f"{called} must be below the {len(samples)} channel(s) of {name}, got {index}")
+        raise ValueError(f"channel must be below the {len(samples)} channel(s) of {name}, got {index}")
     return index
 
 

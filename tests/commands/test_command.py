@@ -60,11 +60,11 @@ ERRORS = {
     "paths inspect untimed.npy --fs 8000": "for example with --file-fs 48000",
     # Channels.
     "verdict stereo.wav PATHS --rated-power 1": "choose a channel, as in stereo.wav:0",
-    "verdict stereo.wav:2 PATHS --rated-power 1": "the channel in stereo.wav:2 must be below the 2",
+    "verdict stereo.wav:2 PATHS --rated-power 1": "channel must be below the 2 channel(s) of stereo.wav, got 2",
     "verdict noise.wav --secondary S.wav --rated-power 1 --disturbance stereo.wav:1": "is channel 0 of noise.wav",
     "verdict stereo.wav --secondary S.wav --rated-power 1 --disturbance ./stereo.wav:1": "is channel 0 of stereo.wav",
     "paths identify stereo.wav d.wav --taps 8 -o x.npy": "name one of stereo.wav:0 to stereo.wav:1",
-    "paths inspect S.wav:1": "the channel in S.wav:1 must be below the 1 channel(s) of S.wav:1",
+    "paths inspect S.wav:1": "channel must be below the 1 channel(s) of S.wav",
     "paths inspect S.wav:0:1": "S.wav:0:1 does not exist",
     "paths inspect S.wav:S": "S.wav is an audio file, which has no named variables",
     "paths identify stereo.wav:0 stereo.wav:0 --taps 8 -o x.npy": "sample for sample: is it the error microphone?",
