@@ -94,15 +94,15 @@ def _judge_residual(
         return
     share = 1.0 - 10 ** (residual_db / 10)
     explained = f"explains {100 * max(share, 0.0):.1f} % of {options.response}"
+    is_related = share >= max(UNRELATED, CHANCE * options.taps / sent.size)
+    if not is_related and (delay := delay_of(sent, heard)) >= options.taps:
+        raise ValueError(
+            f"{options.response} comes {1e3 * delay / fs:.3g} ms after {options.excitation}, but --taps {options.taps} last "
+            f"{1e3 * options.taps / fs:.3g} ms: give --taps {delay + options.taps}, or a shorter latency; nothing was written"
+        )
     if fault := timing_fault(sent, heard, fs, (options.excitation, options.response)):
         raise ValueError(f"{options.excitation} {explained}: {fault} Nothing was written")
-    if share < max(UNRELATED, CHANCE * options.taps / sent.size):
-        delay = delay_of(sent, heard)
-        if delay >= options.taps:
-            raise ValueError(
-                f"{options.response} comes {1e3 * delay / fs:.3g} ms after {options.excitation}, but --taps {options.taps} last "
-                f"{1e3 * options.taps / fs:.3g} ms: give --taps {delay + options.taps}, or a shorter latency; nothing was written"
-            )
+    if not is_related:
         raise ValueError(
             f"{options.excitation} {explained}, hardly more than chance would: are the files swapped, or of different "
             "recordings? Give what was sent to the amplifier first, then what the microphone heard at the same time; "

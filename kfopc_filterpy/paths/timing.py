@@ -7,6 +7,7 @@ import numpy as np
 _SEGMENT_S, _LEAST_SEGMENTS, _MOST_SEGMENTS = 1.0, 8, 64
 _LEAST_DELAY, _LEAST_JUMP = 0.5, 8  # samples by which the delay must change over a record, or at once
 _LARGEST_DRIFT = 1e-3  # of clocks; quartzes differ by less, so more is a jump between the halves
+_LEAST_POWER = 0.01  # of the loudest segment: in a pause, nothing tells the delay
 _LEAST_GAIN = 0.8  # of the power left unexplained, once the delay is put right: what does less is not the cause
 _LEAST_PEAK = 100  # times the mean square of a response; of a million samples of noise, the highest has 28 times
 _LEAST_LEAD = 0.5  # of a response's energy that comes before time 0: the files are swapped
@@ -45,6 +46,8 @@ def plays_once(sent: np.ndarray) -> bool:
 
     Then clocks that differ and lost samples cannot be told from a path that delays some frequencies more than others.
     """
+    if sent.size < 2 * _FRAMES:
+        return False
     frames = sent[: sent.size // _FRAMES * _FRAMES].reshape(_FRAMES, -1)
     power = np.abs(np.fft.rfft(np.hamming(frames.shape[1]) * frames)) ** 2
     loudest = np.argmax(power, axis=0)
@@ -99,7 +102,10 @@ def _responses(sent: np.ndarray, heard: np.ndarray) -> np.ndarray:
 
 
 def _delays(sent: np.ndarray, heard: np.ndarray) -> np.ndarray:
-    """Return the delay of each segment, in samples from that of the loudest, by comparing their responses."""
+    """Return the delay of each segment, in samples from that of the loudest, by comparing their responses.
+
+    A pause has the delay of the segments beside it.
+    """
     spectra = np.fft.rfft(_responses(sent, heard))
     similar = np.fft.irfft(np.conj(spectra[np.argmax(np.sum(heard**2, axis=1))]) * spectra)
     peaks = np.argmax(similar, axis=1)
@@ -108,7 +114,9 @@ def _delays(sent: np.ndarray, heard: np.ndarray) -> np.ndarray:
     curvature = before - 2 * at + after
     fine = np.divide(before - after, 2 * curvature, out=np.zeros_like(at), where=curvature < 0)
     whole = (peaks + similar.shape[1] // 2) % similar.shape[1] - similar.shape[1] // 2
-    return np.asarray(whole + fine)
+    powers = np.sum(sent**2, axis=1)
+    loud = np.flatnonzero(powers > _LEAST_POWER * powers.max())
+    return np.interp(np.arange(len(powers)), loud, (whole + fine)[loud])
 
 
 def _lead(sent: np.ndarray, heard: np.ndarray) -> int:

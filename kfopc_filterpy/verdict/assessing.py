@@ -251,9 +251,8 @@ def assess(
     loop = _settled_loop(run, s, secondary_path_uncertainty) if feedback else None
     coherence_db = None
     if disturbance is not None and not feedback:
-        segment = int(
-            2 ** np.clip(np.floor(np.log2(max(bounds.x.shape[-1] / 16, 8))), 3, 14)
-        )  # as long as sixteen of them allow
+        # Segments as long as sixteen of them allow.
+        segment = int(2 ** np.clip(np.floor(np.log2(max(bounds.x.shape[-1] / 16, 8))), 3, 14))
         coherence_db = max(coherence_bound(bounds.x, bounds.d, fs, segment=segment).overall_db, bounds.time_db)
     ceilings = Ceilings(coherence_db, bounds.time_db, bounds.filter_db, within_power_db)
     cause = None if reached >= want_db else _cause(ceilings, want_db, late >= settings.n_taps)

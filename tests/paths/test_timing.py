@@ -103,9 +103,11 @@ def test_swapped_files_are_told(sent):
     )
 
 
+@pytest.mark.parametrize("silent_from", [N // 2, N])
 @pytest.mark.parametrize("noise_gain", [0, 0.5, 3])
-def test_recordings_of_one_clock_have_no_fault_however_noisy(sent, noise_gain):
-    heard = with_clock(0) + noise_gain * np.random.default_rng(0).standard_normal(N) * sent.std()
+def test_recordings_of_one_clock_have_no_fault_however_noisy(sent, noise_gain, silent_from):
+    sent, heard = (np.where(np.arange(N) < silent_from, signal, 0.0) for signal in (sent, with_clock(0)))
+    heard = heard + noise_gain * np.random.default_rng(0).standard_normal(N) * sent.std()
     assert timing_fault(sent, heard, FS, ("x", "d")) is None
 
 
