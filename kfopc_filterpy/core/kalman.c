@@ -5,9 +5,7 @@
 typedef struct {
     signals s;
     covariance c;
-    real *scaled;     /* (S, K) alpha d^, the measurements */
-    real *innovation; /* (S, K) of the last sample */
-    real *variance;   /* (K) S of eq. 7, of the last sample */
+    real *scaled; /* (S, K) alpha d^, the measurements */
 } kalman;
 
 enum { STATE_NOISE, MEASUREMENT_NOISE, INITIAL_VARIANCE, FADING };
@@ -23,8 +21,6 @@ static void layout_kalman(anc_view *view, const anc_plan *plan, anc_layout *at)
     (void)plan;
     layout_covariance(&f->c, states(&f->s), at);
     f->scaled = reals(at, "measurement", ANC_SCRATCH, 1, 1, f->s.S, f->s.K);
-    f->innovation = reals(at, "innovation", ANC_STATE, 1, 1, f->s.S, f->s.K);
-    f->variance = reals(at, "innovation_variance", ANC_STATE, 1, 1, 1, f->s.K);
 }
 
 static void start_kalman(anc_view *view)
@@ -51,12 +47,10 @@ static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
     const real S = project(&f->c, q) + q; /* eq. 7 */
     const int tell = tells(&f->c, S);
     const real inverse_root = tell ? downdate(&f->c, S) : 0;
-    if (z) f->variance[k] = S;
     for (int32_t scenario = 0; scenario < f->s.S; scenario++) {
         real *w = weights_of(&f->s, scenario * f->s.J);
         const real measured = z ? z[scenario * K + k] : 0;
         const real y = measured - dot(f->c.h, w, f->c.n);
-        if (z) f->innovation[scenario * K + k] = y;
         if (tell) correct(&f->c, w, y, inverse_root);
     }
 }
