@@ -42,8 +42,7 @@ class Algorithm:
         Function of a scene, the first setting in the scene's units, and the second setting, which returns these keyword
         arguments; those that all algorithms share are left out.
     symbol : str
-        Parameter that the first setting sets: "r", "mu", "mu of a block", "1 - lambda" or
-        "averaging_s".
+        Parameter that the first setting sets: "r", "mu", "mu of a block", "1 - lambda" or "averaging_s".
     kind : str
         The first setting as a formula, without units.
     first : tuple of float

@@ -198,7 +198,10 @@ def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = Non
     parser.add_argument("--tasks", default="*", metavar="NAME", help="tasks whose name fits, such as 'duct-*'")
     parser.add_argument("--only", default="*", metavar="NAME", help="entries whose name fits, such as 'KF-*'")
     parser.add_argument(
-        "--output", type=Path, default=Path("benchmark"), help="folder for benchmark.json (default: benchmark)"
+        "--output",
+        type=Path,
+        default=Path("benchmark"),
+        help="folder for benchmark.json and events.png (default: benchmark)",
     )
     options = parser.parse_args(arguments)
     commands = dict(one.partition("=")[::2] for one in options.entry)
@@ -235,9 +238,9 @@ def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = Non
         }
         for outcome in outcomes
     }
-    if figure := event_figure(outcomes):
-        figure.savefig(options.output / "events.png", dpi=150)
     written = options.output / "benchmark.json"
     write_whole(written, json.dumps({"version": __version__, "tasks": found}, indent=1) + "\n")
     print(f"{written} written")
+    if figure := event_figure(outcomes):
+        figure.savefig(options.output / "events.png", dpi=150)
     return 0
