@@ -31,8 +31,8 @@ _STATED = {
     "hz": re.compile(r"\b(?:sampl\w*[ _-]*(?:rate|freq\w*)|(f_?s|sr))" + _AFTER, re.IGNORECASE),
     "s": re.compile(r"\b(?:sampl\w*[ _-]*(?:interval|period)|(dt|delta_x))" + _AFTER, re.IGNORECASE),
 }
-_UNIT = re.compile(  # in brackets, after the slash of "p/Pa", or alone, unless a name; "mPa/V" is of a path
-    r"(?:[(\[]\s*|^[^(\[]*?/\s*|^\W*(?![ANg]\W*$))([muk\u00b5\u03bc]?)([Pp]ascals?|Pa|[Vv]olts?|V|A|N|g|m/s(?:\u00b2|\^?2)?)"
+_UNIT = re.compile(  # in brackets, alone, unless a name, or after the slash of "p/Pa"; "mPa/V" is of a path
+    r"(?:[(\[]\s*|^\W*(?![ANg]\b)|^[^(\[]*?/\s*)([muk\u00b5\u03bc]?)([Pp]ascals?|Pa|[Vv]olts?|V|A|N|g|m/s(?:\u00b2|\^?2)?)"
     r"(?:/([muk\u00b5\u03bc]?)(Pa|V|A|N|W))?\s*[)\]]?\W*$"
 )
 PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "\u00b5": 1e-6, "\u03bc": 1e-6, "n": 1e-9}

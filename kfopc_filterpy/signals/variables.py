@@ -126,7 +126,7 @@ def _rate_and_start(
                 rates.append(rate_of_step(interval, path, rounding_of(times) / np.ptp(times)))
                 starts.append(float(times[0]))
         stated = sorted(filter(None, rates))
-        if stated and stated[-1] > (1 + SAME_RATE) * stated[0]:
+        if stated and stated[-1] - stated[0] > SAME_RATE * abs(stated[0]):
             raise ValueError(f"{path} states several sampling rates beside {name!r}, {stated} Hz: leave only one")
         if stated:
             return stated[0], starts[0] if starts else 0.0

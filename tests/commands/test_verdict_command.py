@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 import sys
+from argparse import Namespace
 from inspect import signature
 from pathlib import Path
 from unittest.mock import Mock
@@ -19,6 +20,7 @@ from helpers.commands import FS, ROOT, SCENE, process
 
 from kfopc_filterpy import Plant, verdict
 from kfopc_filterpy.commands import main
+from kfopc_filterpy.commands.inputs import calibration_of
 from kfopc_filterpy.controllers.kf_pb import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.signals import band_limited_noise, read_recording, write_wav
@@ -199,7 +201,9 @@ def test_units_that_files_state_count_and_are_not_contradicted(command, folder):
             folder / f"{name}_{unit[0]}.mat", {"p": soundfile.read(folder / f"{name}.wav")[0], "fs": FS, "unit": unit}
         )
     scene = ["verdict", "noise_V.mat", "--secondary", "S_m.mat", "--watt", "10", "--ohm", "8", "--json", "--taps", "64"]
-    stated = json.loads(command(*scene, "--disturbance", "d_P.mat")[1])
+    both = [soundfile.read(folder / f"{name}.wav")[0] for name in ("noise", "d")]
+    scipy.io.savemat(folder / "both.mat", {"p": both, "fs": FS, "unit": np.array(["V", "Pa"], dtype=object)})
+    stated = json.loads(command(*scene, "--disturbance", "both.mat:1")[1])
     plain = ["verdict", "noise.wav", "--disturbance", "d.wav", "--secondary", "S.wav", *scene[4:]]
     given = json.loads(command(*plain, "--pascal-per-unit", "1", "--volts-per-unit", "1")[1])
     assert stated | {"origin": None} == given | {"origin": None}
@@ -211,6 +215,11 @@ def test_units_that_files_state_count_and_are_not_contradicted(command, folder):
         code, _, err = command(*scene, "--disturbance", *more)
         assert code == 2
         assert re.search(message, err)
+
+
+def test_pascals_may_be_given_for_volts():
+    options = Namespace(pascal_per_unit=[20.0], calibrator=None, noise="x", disturbance="d", secondary=["S"])
+    assert calibration_of(options, Mock(units={"d": "V", "S": "V/V"}), 1) == 20.0
 
 
 def test_channels_and_variables_are_named_with_their_files(command, folder):

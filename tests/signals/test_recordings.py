@@ -99,12 +99,16 @@ def test_matlab_7_3_has_what_matlab_would_show(tmp_path):
         file.create_dataset("paths", data=paths.T).attrs["MATLAB_class"] = np.bytes_("double")
         empty = file.create_dataset("none", data=np.uint64([0, 3]))
         empty.attrs["MATLAB_class"], empty.attrs["MATLAB_empty"] = np.bytes_("double"), np.uint8(1)
+        text = file.create_dataset("unit", data=np.uint64([0, 0]))  # MATLAB's ''
+        text.attrs["MATLAB_class"], text.attrs["MATLAB_empty"] = np.bytes_("char"), np.uint8(1)
         complex_numbers = np.zeros((1, 3), dtype=[("real", "f8"), ("imag", "f8")])
         file.create_dataset("z", data=complex_numbers).attrs["MATLAB_class"] = np.bytes_("double")
         file["elsewhere"] = h5py.ExternalLink(str(tmp_path / "other.mat"), "noise")
         outside = file.create_dataset("outside", (4,), "f8", external=[(str(path), 0, 32)])
         outside.attrs["MATLAB_class"] = np.bytes_("double")
-    np.testing.assert_array_equal(read_recording(path, variable="two").samples, signal(2).astype(np.float32))
+    two = read_recording(path, variable="two")
+    np.testing.assert_array_equal(two.samples, signal(2).astype(np.float32))
+    assert two.unit == "1"
     for name, message in (
         ("none", r"variable 'none' of .* is empty"),
         ("z", r"variable 'z' of .* must hold real numbers, got complex numbers"),
