@@ -143,7 +143,7 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
     static anc_real output[MOST * (4 * PATH + 64)], present[3 * MOST];
     const int32_t windows[MOST] = {WINDOW, WINDOW, WINDOW},
                   power_windows[MOST] = {WINDOW, 0, WINDOW / 2};
-    const anc_real far = kind == HARD ? 1e35f : 1e6f, limit[MOST] = {far, far, far};
+    const anc_real loudest = kind == HARD ? 1e35f : 1e6f, limit[MOST] = {loudest, loudest, loudest};
     const anc_amplifier amplifiers[MOST] = {
         {ANC_SOFT_SATURATION, 0.5f, 1.75f}, {ANC_HARD_CLIP, 0.5f, 1}, {ANC_LINEAR, 1, 1}};
     controller c = {.algorithm = algorithms[number].algorithm};
