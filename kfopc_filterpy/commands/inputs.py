@@ -141,8 +141,7 @@ class Files:
         from ..signals.recordings import read_content, recording_of
 
         named = _named(path)
-        content = read_content(named.file, channel=named.channel, variable=named.variable)
-        file_fs = None
+        content, file_fs = read_content(named.file, channel=named.channel, variable=named.variable), None
         if content.fs is None or content.fs < LEAST_SURE_RATE:
             file_fs, self._without_rate = self.options.file_fs, True
             if file_fs is None and content.fs is None:

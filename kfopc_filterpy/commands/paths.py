@@ -195,6 +195,8 @@ def _require_output(output: str) -> None:
     """Raise ValueError or OSError if a path cannot be written: better before it is made than after."""
     if Path(output).suffix.lower() not in WRITTEN:
         raise ValueError(f"{output} must end in {', '.join(WRITTEN)}")
+    if not Path(output).parent.is_dir():
+        raise FileNotFoundError(f"the folder {Path(output).parent} does not exist: make it first")
     require_writable(Path(output).parent)
 
 

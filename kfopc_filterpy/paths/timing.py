@@ -29,10 +29,8 @@ def timing_fault(sent: np.ndarray, heard: np.ndarray, fs: float, names: tuple[st
     n = min(sent.size, heard.size)
     sent, heard = sent[:n] - np.mean(sent), heard[:n] - np.mean(heard)
     left = _unexplained(sent, heard)
-    for count in (
-        int(np.clip(n / (_SEGMENT_S * fs), _LEAST_SEGMENTS, _MOST_SEGMENTS)),
-        *([] if plays_once(sent) else [2]),
-    ):
+    segments = int(np.clip(n / (_SEGMENT_S * fs), _LEAST_SEGMENTS, _MOST_SEGMENTS))
+    for count in (segments,) if plays_once(sent) else (segments, 2):
         cause, places = _cause(sent, heard, count, fs, names[1])
         if cause and _unexplained(sent, map_coordinates(heard, [places], order=3)) < _LEAST_GAIN * left:
             return cause

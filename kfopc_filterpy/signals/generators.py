@@ -170,7 +170,8 @@ def compressor_noise(
     generator = as_generator(rng)
     shaft, upper = as_positive(shaft_hz, "shaft_hz", unit="Hz"), as_positive(bandwidth_hz, "bandwidth_hz", unit="Hz")
     if not _BROADBAND_FROM_HZ < upper <= fs / 2:
-        raise ValueError(f"bandwidth_hz must be above {_BROADBAND_FROM_HZ:g} Hz and at most fs/2, got {upper:g} Hz")
+        bounds = f"above {_BROADBAND_FROM_HZ:g} Hz and at most fs/2 = {fs / 2:g} Hz"
+        raise ValueError(f"bandwidth_hz must be {bounds}, got {upper:g} Hz")
     # Five standard deviations: a Gaussian speed exceeds them once in two million correlation times.
     highest = _N_HARMONICS * shaft * (1 + 5 * _SPEED_FLUCTUATION)
     if highest >= fs / 2:

@@ -63,6 +63,7 @@ ERRORS = {
     "verdict stereo.wav:2 PATHS --rated-power 1": "channel must be below the 2 channel(s) of stereo.wav, got 2",
     "verdict noise.wav --secondary S.wav --rated-power 1 --disturbance stereo.wav:1": "is channel 0 of noise.wav",
     "verdict stereo.wav --secondary S.wav --rated-power 1 --disturbance ./stereo.wav:1": "is channel 0 of stereo.wav",
+    "paths identify noise.wav d.wav --taps 8 -o none/x.npy": "the folder none does not exist: make it first",
     "paths identify stereo.wav d.wav --taps 8 -o x.npy": "name one of stereo.wav:0 to stereo.wav:1",
     "paths inspect S.wav:1": "channel must be below the 1 channel(s) of S.wav",
     "paths inspect S.wav:0:1": "S.wav:0:1 does not exist",
