@@ -297,12 +297,12 @@ def calibration_of(options: argparse.Namespace, files: Files, n_microphones: int
         for path in options.calibrator:
             pascals.append(calibration_factor(files.calibrator(path), options.calibrator_db))
     errors = options.disturbance or options.noise
-    stated = {path: files.units[path].partition("/")[0] for path in (errors, *options.secondary) if path in files.units}
+    stated = {path: files.units[path] for path in (errors, *options.secondary) if path in files.units}
     if options.disturbance is None and options.primary is not None:
         del stated[errors]  # of the reference
-    units = {unit for unit in stated.values() if unit != "1"}
+    units = {one.partition("/")[0] for unit in stated.values() for one in unit.split(", ")} - {"1"}
     if len(units) > 1 or (pascals is not None and units == {"Pa"} and set(pascals) != {1.0}):
-        is_in = ", ".join(f"{path} is in {files.units[path]}" for path, unit in stated.items() if unit != "1")
+        is_in = ", ".join(f"{path} is in {unit}" for path, unit in stated.items() if unit != "1")
         scale = "" if pascals is None else f", but {option} gives {', '.join(f'{one:.4g}' for one in pascals)} Pa for 1"
         raise ValueError(f"{is_in}{scale}: the error microphones need one unit")
     if units == {"Pa"}:

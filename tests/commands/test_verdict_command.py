@@ -220,6 +220,8 @@ def test_units_that_files_state_count_and_are_not_contradicted(command, folder):
 def test_pascals_may_be_given_for_volts():
     options = Namespace(pascal_per_unit=[20.0], calibrator=None, noise="x", disturbance="d", secondary=["S"])
     assert calibration_of(options, Mock(units={"d": "V", "S": "V/V"}), 1) == 20.0
+    with pytest.raises(ValueError, match=r"d is in Pa, V, S is in V/V, .* need one unit"):
+        calibration_of(options, Mock(units={"d": "Pa, V", "S": "V/V"}), 2)
 
 
 def test_channels_and_variables_are_named_with_their_files(command, folder):
