@@ -199,7 +199,7 @@ class Twins(RuleBasedStateMachine):
             )
         np.testing.assert_array_equal(np.ravel(self.ours.z), np.where(there, z, np.nan))
         assert not self.ours.y[~there].any()
-        assert not self.ours.K[:, ~there].any()
+        np.testing.assert_allclose(self.ours.K[:, ~there], 0.0, rtol=0, atol=1e-12)  # the rounding of a pseudo-inverse
         for name in STATE:
             setattr(self.oracle, name, np.copy(getattr(self.ours, name)))
         self.oracle._log_likelihood = self.oracle._likelihood = None
