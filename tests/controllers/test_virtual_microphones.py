@@ -198,6 +198,14 @@ def test_models_that_do_not_fit_are_refused(model: Any, changed: dict, error: ty
         KalmanObserver(model, 1, **({"sensor_noise_std": 0.1} | changed))
 
 
+def test_a_block_whose_place_for_the_control_signal_does_not_fit_changes_nothing() -> None:
+    x, e = noise(40), np.random.default_rng(1).standard_normal((4, 40))
+    refused, usual = made(), made()
+    with pytest.raises(ValueError, match="out must be"):
+        refused.process(x, e, out=np.zeros((J, 39)))
+    np.testing.assert_array_equal(refused.process(x, e), usual.process(x, e))
+
+
 def test_a_run_at_another_rate_is_refused() -> None:
     paths = random_paths(2, 1, 6, seed=1)
     inner_one = kf_pb(TAPS, paths[1:], rated_power=1.0, fs=FS)
