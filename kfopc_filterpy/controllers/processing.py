@@ -33,7 +33,7 @@ class BlockProcessing:
     """Gives a controller `process`, by its two methods per sample."""
 
     def process(
-        self: Any,
+        self,
         references: ArrayLike | None,
         errors: ArrayLike,
         *,
@@ -89,20 +89,27 @@ class BlockProcessing:
         >>> controller.process(block, 0.5 * block).shape
         (64,)
         """
-        x, e, flags, y = checked_block(self, references, errors, adapt, out)
-        none = takes_none(self, references)
-        with getattr(self, "in_use", nullcontext()):
-            for n in range(x.shape[-1]):
-                sample = self.control_signal(None if none else x[..., n])
-                if n == 0:
-                    y = output_array(y, (*np.shape(sample), x.shape[-1]))
-                y[..., n] = sample
-                if flags[n] or getattr(self, "internal_model", False):
-                    try:
-                        (self.update if flags[n] else self.take_error)(e[..., n])
-                    except ValueError as error:
-                        raise RefusedUpdate(str(error), n) from error
-        return y
+        return process_steps(self, references, errors, adapt=adapt, out=out)
+
+
+def process_steps(
+    controller: Any, references: ArrayLike | None, errors: ArrayLike, *, adapt: bool | ArrayLike, out: np.ndarray | None
+) -> np.ndarray:
+    """Process a block with the two methods per sample of any controller; see `BlockProcessing.process`."""
+    x, e, flags, y = checked_block(controller, references, errors, adapt, out)
+    none = takes_none(controller, references)
+    with getattr(controller, "in_use", nullcontext()):
+        for n in range(x.shape[-1]):
+            sample = controller.control_signal(None if none else x[..., n])
+            if n == 0:
+                y = output_array(y, (*np.shape(sample), x.shape[-1]))
+            y[..., n] = sample
+            if flags[n] or getattr(controller, "internal_model", False):
+                try:
+                    (controller.update if flags[n] else controller.take_error)(e[..., n])
+                except ValueError as error:
+                    raise RefusedUpdate(str(error), n) from error
+    return y
 
 
 def checked_block(

@@ -56,9 +56,9 @@ class KFOPC(KalmanFilter, Checkpointed):
        \hat w(n|n) &= \hat w(n|n-1) \\
        &\ + K(n) [\alpha \hat d(n) - x'^T(n) \hat w(n|n-1)]
 
-    With ``rated_power=None`` it is filterpy's filter bit for bit, except that
-    arguments that would corrupt that filter (NaN, Inf, complex numbers, a wrong shape, a negative variance, a P that is
-    not positive semidefinite) raise an error before anything changes. The page "What differs from filterpy" lists them.
+    With ``rated_power=None`` it is filterpy's filter bit for bit, except that arguments that would corrupt that filter
+    (NaN, Inf, complex numbers, a wrong shape, a negative variance, a P that is not positive semidefinite) raise an error
+    before anything changes. The page "What differs from filterpy" lists them.
     `F` and `H` may be nested lists, which are stored as arrays.
 
     Parameters

@@ -16,7 +16,7 @@ from ..checkpoint import Checkpointed
 from ..controllers.base import Controller, WrappedController, checked_controller
 from ..controllers.channel_samples import through
 from ..controllers.core_controller import CoreController
-from ..controllers.processing import BlockProcessing
+from ..controllers.processing import process_steps
 from ..paths.uncertainty import GUARD_TAPS
 from ..power.limiter import OutputLimiter
 from .adaptation import Adaptation
@@ -470,7 +470,7 @@ class Supervisor(Checkpointed):
     def _adapted(self, x: np.ndarray, e: np.ndarray, adapt: np.ndarray) -> np.ndarray:
         """Return the controller's outputs, (J, n): zeros if it cannot go on."""
         y = np.zeros((self.n_loudspeakers, x.shape[1]))
-        process: Any = getattr(self.controller, "process", None) or partial(BlockProcessing.process, self.controller)
+        process: Any = getattr(self.controller, "process", None) or partial(process_steps, self.controller)
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 process(self._shaped(x), self._shaped(e), adapt=adapt, out=self._shaped(y))
