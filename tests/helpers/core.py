@@ -113,13 +113,12 @@ def program(
 ) -> Path:
     """Compile a program of tests/core with the sources of the core, or against a library, and return its path."""
 
-    def numbers(settings: Mapping[str, float]) -> str:
-        return ", ".join(f"(anc_real){value!r}" for value in settings.values())
+    def row(name: str, plain: Mapping[str, float]) -> str:
+        each = [{**plain, **own.get(name, {})} for own in ({}, EQUIPPED, HARD)]
+        settings = [", ".join(f"(anc_real){value!r}" for value in one.values()) for one in each]
+        return f"{{ALGORITHM({name}), {{{', '.join(f'{{{one}}}' for one in settings)}}}}}"
 
-    rows = ", ".join(
-        f"{{ALGORITHM({name}), {{{', '.join(f'{{{numbers({**plain, **own.get(name, {})})}}}' for own in ({}, EQUIPPED, HARD))}}}}}"
-        for name, plain in ALGORITHMS.items()
-    )
+    rows = ", ".join(row(name, plain) for name, plain in ALGORITHMS.items())
     table = "static struct { const char *name; const anc_algorithm *algorithm; anc_real settings[3][8]; } algorithms[]"
     (folder / "algorithms.h").write_text(f"{table} = {{{rows}, {{0}}}};\n")
     made = folder / name

@@ -74,9 +74,8 @@ def build(tree: Path, objects: Path, name: str) -> bool:
     assert spec.loader is not None
     building = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(building)
-    flags = [flag for flag in building.flags(["gcc"]) if flag != "-shared"] + [
-        "-O1"
-    ]  # compiled sooner, to the same bits
+    given = (flag for flag in building.flags(["gcc"]) if flag != "-shared")
+    flags = [*given, "-O1"]  # compiled sooner, to the same bits
     for path in building.core_sources(core):
         made = objects / f"{path.stem}.o"
         current = made.exists() and path.name not in (name, "stamp.c")

@@ -191,7 +191,8 @@ def faults() -> list[str]:
             path = woven(HERE / "limiter.acsl", Path(made), *change)[-1]
             left = goals(path, Path(made), "-wp-fct", function, patience_s=FAULT_S)
         noticed = bool(left) and all(line.startswith("[wp] [") for line in left)  # else the code was not read
-        if bool(left) if name in right else not noticed:
+        as_it_should = not left if name in right else noticed
+        if not as_it_should:
             wrong.append(f"{name}: {left}")
     return wrong
 
