@@ -103,9 +103,7 @@ def draw(levels_db: Sequence[float], runs: dict[str, np.ndarray], bounds: Sequen
         left.plot(levels_db, bounds, color="0.78", lw=6, solid_capstyle="round", label="most within rated power")
         for name in ALGORITHMS:
             for ax, values in zip((left, right), runs[name], strict=True):
-                ax.plot(
-                    levels_db, values, **curve_style(name), lw=2, ms=6, clip_on=ax is right, zorder=3, label=SAID[name]
-                )
+                ax.plot(levels_db, values, **curve_style(name), lw=2, ms=6, zorder=3, label=SAID[name])
         for name, height in (("KF-OPC", 3.0), ("KF-PB", 0.33)):
             text = f"{runs[name][1, -1]:.2f} times"
             right.text(11.8, height, text, color=curve_style(name)["color"], weight="bold", ha="right", va="center")
@@ -114,8 +112,9 @@ def draw(levels_db: Sequence[float], runs: dict[str, np.ndarray], bounds: Sequen
         left.set(title="Noise reduction (dB)", ylim=(-4, 32))
         right.set(title="Power asked for / rated power", yscale="log", ylim=(0.12, 3e3))  # the plain filter leaves it
         for ax in (left, right):
-            ax.axvspan(0, max(levels_db), color="#D55E00", alpha=0.06, lw=0)
-            ax.set(xlim=(min(levels_db), max(levels_db)), xticks=(0, 3, 6, 9, 12))
+            ends = min(levels_db) - 0.5, max(levels_db) + 0.5  # whole markers
+            ax.axvspan(0, ends[1], color="#D55E00", alpha=0.06, lw=0)
+            ax.set(xlim=ends, xticks=(-3, 0, 3, 6, 9, 12))
             ax.grid(alpha=0.3)
         figure.supxlabel("Noise level (dB over what the rated power can cancel)", fontsize=11.5)
         handles, labels = left.get_legend_handles_labels()

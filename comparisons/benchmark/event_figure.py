@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy.metrics import nse_db
+from kfopc_filterpy.plot import curve_style
 
 from ..bench import run_setting
 from ..bench.changes import CHANGES
-from ..studies.report_parts import legend_of, new_figure, thin_style
+from ..studies.report_parts import legend_of, new_figure
 from .tasks import JUDGED, Task
 
 SHOWN = ("MOV-FxLMS", "KF-OPC", "KF-PB")
-COLUMNS, WINDOW_S, STEP_S = 4, 0.1, 0.01
+COLUMNS, WINDOW_S, STEP_S = 2, 0.1, 0.01
 LIMITS_DB = (-10.0, 42.0)
 
 
@@ -25,7 +26,7 @@ def event_figure(outcomes: Sequence[Mapping[str, Any]]) -> Any:
     if not chosen:
         return None
     rows = -(-len(chosen) // COLUMNS)
-    figure, axes = new_figure((10.0, 0.7 + 1.9 * rows), rows, COLUMNS, sharex=True, sharey=True)
+    figure, axes = new_figure((7.0, 0.7 + 1.6 * rows), rows, COLUMNS, sharex=True, sharey=True)
     for ax, outcome in zip(axes.flat, chosen, strict=False):
         task, settings = outcome["task"], {one.entry: one.setting for one in outcome["scores"] if not one.failed}
         after_s = task.changed_at_s + task.change.lasting_s
@@ -36,7 +37,8 @@ def event_figure(outcomes: Sequence[Mapping[str, Any]]) -> Any:
         for name in SHOWN:
             run = run_setting(task, name, settings[name], JUDGED) if name in settings else None
             if run is not None:
-                ax.plot(*curve(task, run.error), **thin_style(name), label=name)
+                ax.plot(*curve(task, run.error), **curve_style(name) | {"marker": "", "linewidth": 1.2}, label=name)
+        ax.axvline(0.0, color="0.4", linewidth=0.8)
         ax.set_title(task.title.rpartition(": ")[2], fontsize="small")
         ax.set(ylim=LIMITS_DB)
     for ax in axes.flat[len(chosen) :]:

@@ -153,12 +153,14 @@ def claims(rows: Sequence[ClassRow]) -> list[Claim]:
 
 def class_table(rows: Sequence[ClassRow]) -> Table:
     """Return a line for each class."""
-    headings = ["class", "cases", "power over 10 s, most", "over the bound, mean dB", "worst dB"]
-    headings += ["over MOV-FxLMS, mean dB", "worst dB", "first second, mean dB", "its power, most"]
+    headings = ["class", "cases", "power, most", "over bound, dB", "worst", "over MOV-FxLMS, dB", "worst"]
+    headings += ["first second, dB", "power, most"]
     lines = []
     for (kind,), own in grouped(rows, "kind").items():
         bound, mov, first = (column(own, name) for name in ("over_bound_db", "over_mov_db", "first_second_db"))
         power, first_power = column(own, "power").max(), column(own, "first_power").max()
         figures = (power, bound.mean(), bound.min(), mov.mean(), mov.min(), first.mean(), first_power)
         lines.append([kind, len(own), *(round(float(figure), 2) + 0.0 for figure in figures)])
-    return Table("classes", "KF-PB by class of noise, from the second second on", headings, lines)
+    return Table(
+        "classes", "KF-PB by class of noise, means from the second second on, and power over 10 s", headings, lines
+    )

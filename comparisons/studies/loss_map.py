@@ -129,16 +129,21 @@ def loss_table(rows: Sequence[LossRow]) -> Table:
 
 def loss_figure(rows: Sequence[LossRow]) -> FigureItem:
     """Return a figure with a bar for each case, from the sensor noise down to what is left."""
+    from matplotlib import colormaps
+
     figure, axes = new_figure((7.0, 1.2 + 0.32 * len(rows)), grid="")
     ax, names = axes[0, 0], [f"{row.path}, {row.noise}" for row in rows]
     left = np.array([row.reduction_db[-1] for row in rows])
-    ax.barh(names, left, color="0.25", label="left")
+    colours = iter(colormaps["cividis"](np.linspace(0.0, 1.0, 1 + len(STAGES))))  # told apart in grey, too
+    ax.barh(names, left, color=next(colours), edgecolor="w", linewidth=0.4, label="left")
     for stage, name in reversed(list(enumerate(STAGES))):
         lost = np.maximum([row.losses_db[stage] for row in rows], 0.0)
-        ax.barh(names, lost, left=left, label=name)
+        ax.barh(names, lost, left=left, color=next(colours), edgecolor="w", linewidth=0.4, label=name)
         left = left + lost
     ax.invert_yaxis()
-    ax.set_xlabel("Noise reduction (dB)")
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    ax.margins(y=0.01)
+    ax.set(xlabel="Noise reduction that is left, and what is lost (dB)", xlim=(0.0, 42.0))
+    row = {"ncols": 1 + len(STAGES), "fontsize": "small", "handlelength": 1.0, "columnspacing": 1.2, "frameon": False}
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", **row)
     caption = "Noise reduction that is left behind a limiter, and what each stage loses; gains are not drawn."
     return FigureItem("losses", caption, figure)
