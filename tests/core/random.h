@@ -1,5 +1,6 @@
-/* For the two programs beside this file: numbers that are equal on every machine, since they come from integers, and the
- * functions of a library that is loaded at run time (-DLOADED), as Python does it, in place of those linked. */
+/* For the two programs beside this file: numbers that are equal on every machine, since they come
+ * from integers, and the functions of a library that is loaded at run time (-DLOADED), as Python
+ * does it, in place of those linked. */
 #ifndef RANDOM_H
 #define RANDOM_H
 #include "anc.h"
@@ -31,11 +32,19 @@ static void find(void *pointer, const char *name)
 static size_t (*size_of)(const anc_algorithm *, const anc_plan *);
 static int (*open_block)(const anc_algorithm *, const anc_plan *, anc_view *, void *, size_t, int);
 static void (*describe)(const anc_algorithm *, const anc_plan *, anc_visitor *, void *);
-static int64_t (*run_loop)(const anc_controller *, anc_plant *, const anc_signals *, const anc_record *, int32_t, int64_t, int64_t, int32_t *);
+static int64_t (*listen_to_block)(const anc_algorithm *, anc_view *, const anc_real *,
+                                  const anc_real *, const uint8_t *, int64_t, int32_t *);
+static void (*refilter_block)(anc_view *);
+static int (*take_error_of)(anc_view *, const anc_real *);
+static int64_t (*run_loop)(const anc_controller *, anc_plant *, const anc_signals *,
+                           const anc_record *, int32_t, int64_t, int64_t, int32_t *);
 #define anc_size size_of
 #define anc_open open_block
 #define anc_describe describe
 #define anc_run run_loop
+#define anc_listen listen_to_block
+#define anc_refilter refilter_block
+#define anc_take_error take_error_of
 #define ALGORITHM(name) "anc_" #name, NULL
 #else
 #define ALGORITHM(name) "anc_" #name, &anc_##name

@@ -14,6 +14,7 @@ enum {
     PATH = 13,
     GUARD = 5,
     SAMPLES = 700,
+    LISTENED = 100,
     WINDOW = 50,
     MOST = 3
 }; /* no multiples of 8 */
@@ -82,20 +83,35 @@ static anc_limiter limiter_of(anc_real budget)
     return c;
 }
 
-/* Put limiters, amplifier models and computed factors into a fresh block. */
+/* PAUSED: after listening, with an internal model and a changed path, and not always adapting. */
+enum { PLAIN, EQUIPPED, HARD, PAUSED };
+
+typedef struct {
+    char *block;
+    int kind;
+} equipment;
+
+/* Put limiters, amplifier models and computed factors into a block; PAUSED: a sharp amplifier, a
+ * power and gains that are known, and another path. */
 static void equip(void *to, const char *name, anc_role role, anc_type type, size_t offset,
                   const int32_t shape[4])
 {
-    char *field = (char *)to + offset;
+    const int paused = ((equipment *)to)->kind == PAUSED;
+    char *field = ((equipment *)to)->block + offset;
     (void)role, (void)type;
     for (int32_t j = 0; j < shape[2]; j++) {
         if (!strcmp(name, "limiter"))
             ((anc_limiter *)(void *)field)[j] = limiter_of(0.25f + (anc_real)j);
         if (!strcmp(name, "amplifier"))
-            ((anc_amplifier *)(void *)field)[j] = (anc_amplifier){(anc_real)(j % 3), 0.5f, 1.75f};
+            ((anc_amplifier *)(void *)field)[j] =
+                (anc_amplifier){(anc_real)((j + 2 * paused) % 3), 0.5f, paused ? 1 << 20 : 1.75f};
+        if (!strcmp(name, "secondary_path") && paused)
+            ((anc_real *)(void *)field)[j * shape[3]] += 0.0625f;
         if (!strcmp(name, "constraint")) {
             anc_constraint *c = (anc_constraint *)(void *)field + j;
             c->rated_power = 0.015625f, c->rate = 0.0078125f, c->supplied_factor = (anc_real)NAN;
+            if (paused && j == 0) c->supplied_power = 0.75f;
+            if (paused && j > 0) c->supplied_gain = (anc_real)(j - 1);
         }
     }
 }
@@ -104,6 +120,7 @@ static void equip(void *to, const char *name, anc_role role, anc_type type, size
 typedef struct {
     const anc_algorithm *algorithm;
     anc_view view;
+    int32_t pause, updates; /* it does not adapt to each error of this number; 0: to all */
 } controller;
 static int control_signal(void *self, const anc_real *x, anc_real *y)
 {
@@ -111,12 +128,12 @@ static int control_signal(void *self, const anc_real *x, anc_real *y)
 }
 static int update(void *self, const anc_real *e)
 {
-    return ((controller *)self)->algorithm->update(&((controller *)self)->view, e);
+    controller *c = self;
+    if (!c->pause || ++c->updates % c->pause) return c->algorithm->update(&c->view, e);
+    return anc_take_error(&c->view, e) || c->algorithm->update(&c->view, NULL);
 }
 
 static anc_real signal[4 * MOST][SAMPLES], reference[MOST][SAMPLES], disturbance[MOST][SAMPLES];
-
-enum { PLAIN, EQUIPPED, HARD };
 
 /* Make the input hard: tones, which excite few directions, first softly, with silence between; and
  * a click. */
@@ -133,11 +150,11 @@ static void harden(int32_t K, int32_t I)
 }
 
 /* Run an algorithm of a shape: plain; equipped with a guard, limiters, amplifiers, windows and
- * computed factors; or on hard input. */
+ * computed factors; on hard input; or paused. */
 static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
 {
-    static const char *const kinds[] = {"plain", "equipped", "hard"};
-    const int equipped = kind == EQUIPPED;
+    static const char *const kinds[] = {"plain", "equipped", "hard", "paused"};
+    const int equipped = kind == EQUIPPED, paused = kind == PAUSED;
     static anc_real estimated[MOST * MOST * PATH], path[MOST * MOST * PATH],
         feedback[MOST * MOST * PATH], guard[GUARD], settings[8 * MOST];
     static anc_real output[MOST * (4 * PATH + 64)], present[3 * MOST];
@@ -146,14 +163,16 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
     const anc_real loudest = kind == HARD ? 1e35f : 1e6f, limit[MOST] = {loudest, loudest, loudest};
     const anc_amplifier amplifiers[MOST] = {
         {ANC_SOFT_SATURATION, 0.5f, 1.75f}, {ANC_HARD_CLIP, 0.5f, 1}, {ANC_LINEAR, 1, 1}};
-    controller c = {.algorithm = algorithms[number].algorithm};
+    controller c = {.algorithm = algorithms[number].algorithm, .pause = paused ? 8 : 0};
     const anc_plan plan = {.scenarios = 1,
                            .microphones = K,
                            .loudspeakers = J,
                            .references = I,
                            .taps = TAPS,
                            .path_taps = PATH,
-                           .guard_taps = equipped ? GUARD : 0,
+                           /* KF-PB takes none */
+                           .guard_taps = equipped || (paused && K > 1) ? GUARD : 0,
+                           .modelled = paused,
                            .power_windows = equipped ? power_windows : NULL,
                            .limiter_windows = equipped ? windows : NULL,
                            .path = estimated,
@@ -178,7 +197,8 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
     const anc_signals signals = {SAMPLES,   reference[0], disturbance[0],   NULL,
                                  signal[0], signal[MOST], signal[2 * MOST], signal[3 * MOST]};
     const anc_controller seen = {&c, control_signal, update, NULL};
-    int32_t status = ANC_RUNNING;
+    uint8_t adapt[LISTENED];
+    int32_t status = ANC_RUNNING, answer = ANC_DONE;
     hash y = {14695981039346656037u, NULL}, states = y;
     anc_real *value = settings, size = 0.5f;
 
@@ -209,7 +229,11 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
         free(room);
         return;
     }
-    if (equipped) anc_describe(c.algorithm, &plan, equip, block);
+    for (int32_t n = 0; n < LISTENED; n++) adapt[n] = n % 16 != 7;
+    if (paused)
+        anc_listen(c.algorithm, &c.view, reference[0], disturbance[0], adapt, LISTENED, &answer);
+    if (equipped || paused) anc_describe(c.algorithm, &plan, equip, &(equipment){block, kind});
+    if (paused) anc_refilter(&c.view);
     const int64_t done = anc_run(&seen, &plant, &signals, NULL, 0, 0, SAMPLES, &status);
     for (int32_t row = 0; row < 4 * MOST; row++)
         for (int32_t n = 0; n < SAMPLES; n++) take_real(&y, signal[row][n]);
@@ -224,13 +248,14 @@ int main(int argc, char **argv)
 #ifdef LOADED
     library = argc > 1 ? argv[1] : "";
     find(&size_of, "anc_size"), find(&open_block, "anc_open"), find(&describe, "anc_describe"),
-        find(&run_loop, "anc_run");
+        find(&run_loop, "anc_run"), find(&listen_to_block, "anc_listen"),
+        find(&refilter_block, "anc_refilter"), find(&take_error_of, "anc_take_error");
     for (int32_t number = 0; algorithms[number].name; number++)
         find(&algorithms[number].algorithm, algorithms[number].name);
 #endif
     (void)argc, (void)argv;
     for (int32_t number = 0; algorithms[number].name; number++)
-        for (int kind = PLAIN; kind <= HARD; kind++) {
+        for (int kind = PLAIN; kind <= PAUSED; kind++) {
             run(number, 1, 1, 1, kind);
             run(number, 2, 3, 2, kind);
         }

@@ -114,12 +114,12 @@ def program(
     """Compile a program of tests/core with the sources of the core, or against a library, and return its path."""
 
     def row(name: str, plain: Mapping[str, float]) -> str:
-        each = [{**plain, **own.get(name, {})} for own in ({}, EQUIPPED, HARD)]
+        each = [{**plain, **own.get(name, {})} for own in ({}, EQUIPPED, HARD, {})]
         settings = [", ".join(f"(anc_real){value!r}" for value in one.values()) for one in each]
         return f"{{ALGORITHM({name}), {{{', '.join(f'{{{one}}}' for one in settings)}}}}}"
 
     rows = ", ".join(row(name, plain) for name, plain in ALGORITHMS.items())
-    table = "static struct { const char *name; const anc_algorithm *algorithm; anc_real settings[3][8]; } algorithms[]"
+    table = "static struct { const char *name; const anc_algorithm *algorithm; anc_real settings[4][8]; } algorithms[]"
     (folder / "algorithms.h").write_text(f"{table} = {{{rows}, {{0}}}};\n")
     made = folder / name
     files = building.core_sources() if sources is None else sources
