@@ -10,7 +10,7 @@ import numpy as np
 
 from .content import Content, require_room, room_of
 from .hdf5 import NUMERIC_CLASSES, read_mat73
-from .variables import chosen_variable
+from .variables import chosen_variable, require_few
 
 _HEAD, _COMPRESSED = 128, 15  # bytes before the parts of a file, and the mark of a compressed one
 
@@ -26,6 +26,7 @@ def read_mat(path: str | os.PathLike[str], variable: str | None) -> Content:
     if version == 1:
         _require_room_unpacked(path)
     contents = whosmat(path)
+    require_few(path, len(contents))  # before the structs among them are read, each from the file's beginning on
     shapes = {name: tuple(map(int, shape)) for name, shape, kind in contents if kind in NUMERIC_CLASSES}
     others = {name: "text" if kind == "char" else kind for name, _, kind in contents if kind not in NUMERIC_CLASSES}
     fields: dict[str, np.ndarray] = {}

@@ -13,7 +13,7 @@ import numpy as np
 from .content import LEAST_SURE_RATE, NO_SIGNAL, Content, agreed_rate, even_step, rate_of_step, rounding_of
 
 _LONGEST_HEADER = 100  # lines
-_LONGEST_STATEMENT = 500  # characters of a line, in which a rate is looked for
+_LONGEST_STATEMENT = 500  # characters of a line, in which a rate or a unit of time is looked for
 _END, _ENOUGH = 4096, 20  # bytes and lines at the end by which a file that was cut is recognised
 _TEKTRONIX = re.compile(
     r'"?Record Length"?(,[^,]*){4}'
@@ -37,11 +37,11 @@ _UNIT = re.compile(  # in brackets, alone, unless a name, or after the slash of 
 )
 PREFIXES = {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "\u00b5": 1e-6, "\u03bc": 1e-6, "n": 1e-9}
 _FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")  # 1.0D-03
-_FIRST_NAME = re.compile(r"[^,;\t]*[,;\t]|\S+\s+")  # of a heading
+_FIRST_NAME = re.compile(r"\A(?:[^,;\t]*[,;\t]|\s*\S+\s+)")  # of a heading
 _FREQUENCY = re.compile(r"\W*(freq|hz\b|f\s*[(\[/]\s*hz)", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d)")
 _ONE_COMMA = re.compile(r"([+-]?\d+),(\d+)(e[+-]?\d+)?", re.IGNORECASE)  # two columns of whole numbers, or one number
-_QUOTED = re.compile(r'"\s*([^"]*)"')
+_QUOTED = re.compile(r'"([^"]*)"')
 
 
 class Table(NamedTuple):
@@ -63,7 +63,7 @@ class _Layout(NamedTuple):
     def plain(self, line: str) -> str:
         """Return a line without quotes, decimal commas and separators around it; a comma within quotes is decimal."""
         if '"' in line:
-            line = _QUOTED.sub(lambda quoted: _DECIMAL_COMMA.sub(".", quoted[1]), line)
+            line = _QUOTED.sub(lambda quoted: _DECIMAL_COMMA.sub(".", quoted[1].lstrip()), line)
         line = line.rstrip()
         line = _DECIMAL_COMMA.sub(".", line) if self.has_decimal_comma else line
         line = _FORTRAN.sub("e", line)
@@ -160,7 +160,7 @@ def _layout(path: str | os.PathLike[str], head: list[str]) -> _Layout:
             if (delimiter is None or delimiter in line) and _are_numbers(layout.plain(line), delimiter):
                 return layout
     shown = next((line.strip() for line in head if line.strip()), "")[:60]
-    gaps = [n for n, line in enumerate(head, 1) if re.search(r"\d\s*([,;\t])\s*\1\s*[-+.\d]", line)]
+    gaps = [n for n, line in enumerate(head, 1) if re.search(r"\d *([,;\t]) *\1 *[-+.\d]", line)]
     raise ValueError(
         f"{path} is text that is no numbers: none in its first {len(head)} lines, which begin with {shown!r}; expected "
         "a column for each channel, at most 100 lines of header"
@@ -256,7 +256,8 @@ def without_time(path: str | os.PathLike[str], table: Table) -> Content:
                 "microphone's calibration file, export the impulse response"
             )
         return Content(columns * factors, None, unit)
-    units = [found[1] for found in map(_TIME_UNIT.match, reversed(header)) if found]
+    stated = (_TIME_UNIT.match(line[:_LONGEST_STATEMENT]) for line in reversed(header))
+    units = [found[1] for found in stated if found]
     if step == 1 and not units:  # the number of each sample
         named = dict(zip(*(line.strip().split(",") for line in header[-2:]), strict=False)) if len(header) > 1 else {}
         if {"Start", "Increment"} <= named.keys():  # an oscilloscope of Rigol
@@ -288,6 +289,7 @@ def _read_rew(path: str | os.PathLike[str], head: list[str]) -> Content:
             f"{path} is REW's minimum-phase version, which has lost the path's delay: export the measured impulse response"
         )
     length, step, start = (float(values[name].replace(",", ".")) for name in needed)
+    _require_line_end(path)
     taps = np.loadtxt((line.replace(",", ".") for line in islice(_lines(path), starts[0] + 1, None)), ndmin=1)
     if taps.shape != (length,):
         raise ValueError(f"{path} is damaged or cut short: its header claims {length:g} samples, got {taps.shape}")

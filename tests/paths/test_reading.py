@@ -71,6 +71,13 @@ def test_rew_without_what_a_path_needs_is_refused(changed, message, tmp_path):
         read_path(rew(tmp_path, [0.0, 0.0, 1.0, -0.5], **changed))
 
 
+def test_rew_that_ends_within_a_number_is_refused(tmp_path):
+    path = rew(tmp_path, np.full(30, 0.123456789))
+    path.write_text(path.read_text()[:-5])
+    with pytest.raises(ValueError, match=r"rew\.txt ends within a line, '0\.12345'.*was it cut"):
+        read_path(path)
+
+
 def test_times_in_text_shift_a_path_too(tmp_path):
     times = (np.arange(50) - 10) / FS
     taps = np.where(times < 0, 0.0, np.exp(-times * 1000))

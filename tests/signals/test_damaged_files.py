@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 import pytest
@@ -197,7 +198,23 @@ def test_a_file_of_very_many_variables_is_refused_at_once(tmp_path):
     np.savez(tmp_path / "x.npz", **{f"v{n}": np.zeros(2) for n in range(1001)})
     with pytest.raises(ValueError, match="holds 1001 variables, at most 1000 are read"):
         read_recording(tmp_path / "x.npz", file_fs=FS)
+    scipy.io.savemat(tmp_path / "x.mat", {f"s{n}": {"field": 0.0} for n in range(1001)})
+    with pytest.raises(ValueError, match="holds 1001 variables, at most 1000 are read"):  # before their fields are
+        read_recording(tmp_path / "x.mat", file_fs=FS)
     np.savez(tmp_path / "x.npz", **{f"v{n}": np.zeros(2) for n in range(1000)})
     with pytest.raises(ValueError, match="and 980 more; choose one") as refused:
         read_recording(tmp_path / "x.npz", file_fs=FS)
     assert len(str(refused.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    "line", ["1" + 100_000 * "\t" + "x", 100_000 * " " + "x", '"' + 100_000 * " ", "0.1" * 100_000]
+)
+@pytest.mark.parametrize("rest", ["0 1\n1 2\n2 4\n", "no numbers\n"])
+def test_a_long_line_takes_a_time_that_grows_with_it_alone(line, rest, tmp_path):
+    """Patterns that try each end of a stretch for each beginning took minutes, where 0.1 s are enough."""
+    path = tmp_path / "x.txt"
+    path.write_text(f"{line}\n{rest}")
+    began = process_time()
+    check(outcome(read_recording, path), path)
+    assert process_time() - began < 5.0
