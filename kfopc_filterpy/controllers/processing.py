@@ -122,6 +122,8 @@ def checked_block(
         raise ValueError("out must not overlap with references or errors: give it memory of its own")
     if hasattr(controller, "multichannel"):
         out = output_array(out, ((controller.n_loudspeakers,) if controller.multichannel else ()) + x.shape[-1:])
+    elif out is not None:  # the first sample shows the channels
+        output_array(out, getattr(out, "shape", ())[:-1] + x.shape[-1:])
     return x, e, flags, out
 
 
@@ -138,6 +140,8 @@ def block_signals(controller: Any, references: Any, errors: Any) -> tuple[np.nda
         if not none:
             require_channels(x, "references", controller.multichannel, controller.n_references)
         require_channels(e, "errors", controller.multichannel, controller.n_microphones)
+    elif hasattr(controller, "physical"):
+        require_channels(e, "errors", True, controller.n_microphones)
     if x.shape[-1] != e.shape[-1]:
         raise ValueError(
             "references and errors of a block must have the same number of samples, "

@@ -173,6 +173,7 @@ class KalmanObserver:
     def advance(self, disturbance: np.ndarray) -> None:
         """Update the state with `disturbance`, the newest sample at the physical microphones, (K_p,)."""
         self._state = self._A @ self._state + self._K @ (disturbance - self._Cp @ self._state)
+        self._state[np.abs(self._state) < np.finfo(float).tiny] = 0.0  # denormal numbers are slow
 
 
 def _matrices(model: Any, n_physical: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:

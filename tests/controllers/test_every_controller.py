@@ -6,7 +6,9 @@ loud, in `test_little_excitation.py`.
 
 from __future__ import annotations
 
+import inspect
 import itertools
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -207,6 +209,7 @@ def test_bad_blocks_are_refused_before_anything_changes(name: str) -> None:
         shared = np.zeros(e.size + 1)
         out, errors = shared[: np.prod(shape)].reshape(shape), shared[1:].reshape(e.shape)
         bad += [
+            (x, e[0] if e.ndim == 2 else np.stack([e, e]), {}, r"errors must be \(.*n_samples.* for this"),
             (x, e, {"out": np.empty(3)}, r"out must be a writable, C-contiguous array of float64 of shape \("),
             (x, e, {"out": out.tolist()}, "out must be"),
             (x, errors, {"out": out}, "out must not overlap"),
@@ -225,6 +228,54 @@ def test_bad_blocks_are_refused_before_anything_changes(name: str) -> None:
             ):
                 take(np.ones(9))
             assert content_of(controller) == before
+
+
+WRONG = [np.nan, -1.0, "x", [], np.ones(9), np.full(10, 1e200), object()]
+
+
+def calls_with_wrong_arguments(kind: type, pair: Any) -> Iterator[tuple[Callable[..., Any], Any, dict[str, Any]]]:
+    """Yield all public methods and the setters of all properties, each with arguments of which one is hardly right.
+
+    `pair` is what a method of two arguments takes: references and errors.
+    """
+    for (name, own), wrong in itertools.product(inspect.getmembers_static(kind), WRONG):
+        if name.startswith("_") or name in ("save", "state", "restore"):
+            continue
+        if isinstance(own, property) and own.fset is not None:
+            yield own.fset, (wrong,), {}
+        if not inspect.isfunction(own):
+            continue
+        _, *parameters = inspect.signature(own).parameters.values()
+        options = [one.name for one in parameters if one.default is not one.empty]
+        n_needed = len(parameters) - len(options)
+        right = pair if n_needed == 2 else (1.0,) * n_needed
+        for k in range(n_needed):
+            yield own, (*right[:k], wrong, *right[k + 1 :]), {}
+        for option in options:
+            yield own, right, {option: wrong}
+
+
+@pytest.mark.parametrize("name", [n for n in ALL if not n.endswith((" limiter", " known amplifier"))])
+def test_a_public_call_that_is_refused_changes_nothing(name: str) -> None:
+    """Whatever is called: a new method is tested here, too."""
+
+    def after_50_samples() -> tuple[Any, bytes]:
+        controller = ALL[name]()
+        Room(controller).run(controller, 50)
+        return controller, content_of(controller)
+
+    (controller, before), refused = after_50_samples(), 0
+    right = Room(controller).heard(slice(50, 60))
+    for call, arguments, options in calls_with_wrong_arguments(type(controller), right):
+        try:
+            call(controller, *arguments, **options)
+        except Exception as error:  # noqa: BLE001 - its message is tested with each method
+            if not isinstance(error, RefusedUpdate):  # which comes after the samples before it
+                assert content_of(controller) == before, (call, arguments, options)
+                refused += 1
+                continue
+        controller, before = after_50_samples()
+    assert refused > 20
 
 
 LISTENERS = [n for n in ALL if hasattr(ALL[n](), "listen") and n not in ("LimitedController", *PYTHONS)]

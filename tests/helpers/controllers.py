@@ -154,15 +154,15 @@ class OwnController:
         self.secondary = np.array([0.0, 1.0])
 
     def control_signal(self, reference: float) -> float:
-        self.x = [reference, *self.x[:-1]]
+        self.x = [float(reference), *self.x[:-1]]
         return float(self.weights @ self.x[:6])
 
     def emitted(self, control_signal: float) -> None:
         self.emissions = [*self.emissions[-4:], control_signal]
 
     def update(self, error: float) -> None:
+        self.weights = self.weights + 0.01 * float(error) * np.array(self.x[1:7])
         self.count += 1
-        self.weights = self.weights + 0.01 * error * np.array(self.x[1:7])
 
     def listen(self, references: Any, errors: Any) -> None:
         self.x = [*references[:-9:-1], *self.x][:8]
