@@ -43,9 +43,9 @@ def test_diagonal_variances_stay_positive_and_a_silent_reference_tells_nothing()
 
 
 def test_a_diagonal_step_that_would_be_too_large_is_left_out() -> None:
-    """Without measurement noise, K = 1/x' for one tap: a reference next to nothing asks for too much."""
-    controller = diagonal_kf(1, [1.0], state_noise=0.0, measurement_noise=0.0)
-    for x in (1e-60, 1e-160):  # of the second, even S underflows
+    """Without measurement noise, K = 1/x' for a first sample: a reference next to nothing asks for too much."""
+    controller = diagonal_kf(2, [1.0], state_noise=0.0, measurement_noise=0.0)
+    for x in (1e-160, 1e-60):  # of the first, even S underflows
         controller.control_signal(x)
         controller.update(1.0)
         assert (controller.weights[0], controller.variances[0]) == (0.0, 1.0)

@@ -92,6 +92,31 @@ def test_unknown_level_and_real_are_refused() -> None:
         library.load("half")
 
 
+# What x86-64-v3 adds to the baseline, and v4 to v3, as Linux calls it.
+V3 = {"pni", "ssse3", "fma", "cx16", "sse4_1", "sse4_2", "movbe", "popcnt", "xsave", "avx", "f16c", "lahf_lm", "abm"}
+V3 |= {"bmi1", "avx2", "bmi2"}
+V4 = {"avx512f", "avx512dq", "avx512cd", "avx512bw", "avx512vl"}
+
+
+@pytest.mark.skipif(
+    platform.machine() != "x86_64" or sys.platform != "linux", reason="levels are of x86, features Linux's"
+)
+def test_the_level_is_that_of_the_features(tmp_path: Path) -> None:
+    """This processor's, as Linux lists them; and on an emulated one, which has no v4, with one feature less each time."""
+    source, made = tmp_path / "level.c", tmp_path / "level"
+    asking = "int anc_processor_level(void); int main(void) { return anc_processor_level(); }"
+    source.write_text(asking)
+    ran(*c_compiler(), f"-I{building.FOLDER}", source, building.FOLDER / "processor.c", "-o", made)
+    features = set(re.findall(r"^flags\s*:(.*)", Path("/proc/cpuinfo").read_text(), re.M)[0].split())
+    expected = 1 if not features >= V3 else 4 if features >= V4 else 3
+    assert subprocess.run([made]).returncode == expected
+    emulator = tool("qemu-x86_64")
+    processors = {"max": 3, "max,level=7": 3, "max,level=6": 1, "max,xlevel=0x80000000": 1}
+    processors |= {f"max,-{feature.replace('sse4_', 'sse4.')}": 1 for feature in V3}
+    got = {name: subprocess.run([emulator, "-cpu", name, made]).returncode for name in processors}
+    assert got == processors
+
+
 def test_libraries_of_this_machine_are_current() -> None:
     """One that is left over from an earlier build would not be noticed before somebody asks for its level."""
     for path in building.FOLDER.glob("libanc-*"):

@@ -23,17 +23,52 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from helpers.core import program
 
 ROOT = Path(__file__).resolve().parents[2]
-CONTROLLERS = ("tests/controllers/test_against_oracles.py", "tests/controllers/test_little_excitation.py")
-TESTS = {
-    "lms.c": ("tests/controllers/test_lms_family.py", *CONTROLLERS),
-    "covariance.c": ("tests/controllers/test_kalman_variants.py", "tests/filters/test_random_walk.py", *CONTROLLERS),
+EVERY = "tests/controllers/test_every_controller.py::test_"
+CONTROLLERS = (  # the quickest first
+    "tests/controllers/test_against_oracles.py",
+    f"{EVERY}blocks_are_the_steps_bit_for_bit",
+    f"{EVERY}runs_together_are_the_runs_one_by_one",
+    f"{EVERY}a_refused_sample_leaves_the_state_as_it_was",
+    "tests/controllers/test_little_excitation.py",
+)
+KALMAN = (
+    "kalman or random_walk or (KF- or RLS) and not KF-PB",
+    "tests/controllers/test_kalman_variants.py",
+    "tests/filters/test_random_walk.py",
+    *CONTROLLERS,
+)
+LOOP = ("tests/loop/test_loop.py", "tests/loop/test_channels.py", "tests/loop/test_changes_in_a_run.py")
+IN_C = "not frequency"  # whose filter is Python's
+TESTS = {  # which, as pytest's -k says it, and of which files
+    "amplifier.c": (IN_C, "tests/power/test_amplifiers.py"),
+    "constraint.c": (IN_C, "tests/power/test_constraint.py", "tests/controllers/test_against_oracles.py"),
+    "controller.c": (
+        IN_C,
+        "tests/core/test_core_refusals.py",
+        "tests/controllers/test_refused_settings.py",
+        *CONTROLLERS,
+    ),
+    "covariance.c": KALMAN,
+    "diagonal.c": ("kalman or diagonal", "tests/controllers/test_kalman_variants.py", *CONTROLLERS),
+    "kalman.c": KALMAN,
     "limiter.c": (
+        IN_C,
         "tests/core/test_core_refusals.py",
         "tests/power/test_limiter.py",
         "tests/realtime/test_limiter_promise.py",
     ),
-    "constraint.c": ("tests/power/test_constraint.py", "tests/controllers/test_against_oracles.py"),
-    "diagonal.c": ("tests/controllers/test_kalman_variants.py", *CONTROLLERS),
+    "lms.c": ("not KF and not RLS and not frequency", "tests/controllers/test_lms_family.py", *CONTROLLERS),
+    "loop.c": (IN_C, *LOOP, *CONTROLLERS),
+    "processor.c": (IN_C, "tests/core/test_building.py::test_the_level_is_that_of_the_features"),
+    "signals.c": (
+        IN_C,
+        "tests/controllers/test_internal_model.py",
+        "tests/controllers/test_new_secondary_path.py",
+        "tests/controllers/test_uncertain_path.py",
+        *LOOP,
+        *CONTROLLERS,
+        "tests/core/test_core_refusals.py",
+    ),
 }
 CHANGES: tuple[tuple[str, Any], ...] = (  # what a line may have, and what it becomes
     *((rf" {re.escape(old)} ", f" {new} ") for old, new in ("+-", "-+", "*/", "/*", "<>", "><")),
@@ -102,8 +137,9 @@ def survives(tree: Path, tests: tuple[str, ...], bits: Path | None) -> bool:
     expected = [line.removeprefix("double ") for line in recorded if line.startswith("double ")]
     if bits and run(tree, str(bits)).stdout.splitlines() != expected:
         return False
-    command = f"{sys.executable} -m pytest -x -q -n0 -p no:cacheprovider -k 'not frequency'"  # which is Python's
-    return not run(tree, " ".join([command, *tests])).returncode
+    which, *files = tests
+    command = f"{sys.executable} -m pytest -x -q -n0 -p no:cacheprovider -k '{which}' {' '.join(files)}"
+    return not run(tree, command).returncode
 
 
 def main(name: str, count: str = "40", *no_bits: str) -> int:
