@@ -49,8 +49,9 @@ const anc_algorithm anc_fxlms = {
  * HELD filter lengths.
  *
  * When a reference is UNHEARD times as loud as those that the weights were learned from, they begin
- * anew. What they were learned from follows within HELD filter lengths, and at first, while the
- * weights are younger than YOUNG filter lengths, a louder reference at once. */
+ * anew, and stay 0 until the path has passed it on: so long, x' is still the soft one. What they
+ * were learned from follows within HELD filter lengths, and at first, while the weights are younger
+ * than YOUNG filter lengths, a louder reference at once. */
 
 enum { REGULARIZATION = STEP_SIZE + 1 };
 static const real QUIET = (real)1e-3, RISE = 4, HELD = 1000, UNHEARD = (real)1e4, YOUNG = 2;
@@ -58,7 +59,7 @@ typedef struct {
     signals s;
     real *usual;   /* energy of the filtered references */
     real *learned; /* energy of the references that the weights were learned from */
-    real *age;     /* of the weights, in samples */
+    real *age;     /* of the weights, in samples; below 0 they wait */
     real *over;    /* what the step size is divided by */
 } normalised;
 static const anc_setting fxnlms[] = {
@@ -86,7 +87,7 @@ static int fxnlms_signal(anc_view *view, const real *reference, real *control)
     if (unheard && *s->setting[REGULARIZATION] == 0) {
         clear(s->weights, times(s->S, states(s)));
         *f->learned = 0;
-        *f->age = 0;
+        *f->age = 1 - (real)s->M;
     }
     emit_all(s, control);
     return ANC_DONE;
@@ -107,7 +108,8 @@ static int update_fxnlms(anc_view *view, const real *error)
     const real energy = filtered_energy(s), heard = energy_of(s, &s->x, 0, s->I), L = (real)s->L;
     const real usual = *f->usual > 0 ? *f->usual : energy, slow = 1 / (HELD * L);
     const real epsilon = *s->setting[REGULARIZATION];
-    *f->over = epsilon > 0 ? epsilon + energy : energy > 0 ? larger(energy, QUIET * usual) : 0;
+    const int learns = energy > 0 && *f->age >= 0;
+    *f->over = epsilon > 0 ? epsilon + energy : learns ? larger(energy, QUIET * usual) : 0;
     const int refused = update(view, error, fxnlms_step);
     if (refused) return refused;
     *f->usual = flushed(held_value(usual, energy, 1 - slow, 1 + RISE / L));

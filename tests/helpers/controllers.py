@@ -126,7 +126,7 @@ SEVERAL: dict[str, Any] = {
 # Controllers that adapt once per block. Runs of 300 samples end within one.
 
 IN_BLOCKS: dict[str, Any] = {
-    "frequency domain": lambda: frequency_domain_fx_lms(N_TAPS, S_HAT, step_size=0.2, block_size=7),
+    "frequency domain": lambda s=S_HAT: frequency_domain_fx_lms(N_TAPS, s, step_size=0.2, block_size=7),
     "block LMS": lambda s=S_HAT: frequency_domain_fx_lms(N_TAPS, s, step_size=MU, block_size=14, forgetting=None),
     "frequency domain, many": lambda: frequency_domain_fx_lms(
         L, PATHS, step_size=0.1, block_size=7, partition_size=14, **MANY
