@@ -368,12 +368,52 @@ def test_two_controllers_of_other_names_link_into_one_program_also_of_cpp(tmp_pa
     succeeds(tmp_path / "main")
 
 
-def test_fast_math_is_refused_by_the_file_itself(tmp_path):
-    path = export_c(ALL["KF-OPC plain"](), tmp_path / "anc.c").path
-    command = [*c_compiler(), "-std=c99", "-ffast-math", "-c", str(path), "-o", str(tmp_path / "anc.o")]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode != 0
-    assert "compile it without -ffast-math" in done.stderr
+STRICT = (
+    "-Wall -Wextra -Wpedantic -Wconversion -Wundef -Wcast-qual -Wcast-align -Wstrict-prototypes -Wmissing-prototypes"
+)
+REFUSED = "compile it without -ffast-math, and not for the x87"
+DIFFERENT = "the self-test failed: this compiler, or one of its flags, changes the arithmetic"
+# What strangers compile with, and what they are told. A processor without fused operations gives the bits in any case.
+FLAGS = [
+    *((cc, flags, "") for cc in ("gcc", "clang") for flags in ("", f"-std=c99 -O2 {STRICT} -Werror", "-std=c11 -Os", "-Og -g")),
+    *((cc, "-O3 -march=native", DIFFERENT) for cc in ("gcc", "clang")),
+    *((cc, "-std=gnu17 -O3 -march=native -ffp-contract=off", "") for cc in ("gcc", "clang")),
+    ("gcc", "-std=c99 -O3 -march=native", ""),  # in which gcc contracts nothing
+    ("gcc", "-O2 -flto -fPIC -fvisibility=hidden", ""),
+    ("gcc", "-O2 -D_FORTIFY_SOURCE=2 -fstack-protector-strong -funsigned-char -fshort-enums", ""),
+    ("gcc", "-O3 -funroll-loops -frounding-math -fwrapv", ""),
+    ("clang", "-O2 -fstrict-aliasing -ftrapping-math -fno-signed-zeros", ""),
+    ("gcc", "-O2 -m32 -msse2 -mfpmath=sse", ""),
+    ("gcc", "-O2 -m32 -mfpmath=387", REFUSED),
+    *(("gcc", f"-O2 {flag}", REFUSED) for flag in ("-ffast-math", "-funsafe-math-optimizations", "-freciprocal-math", "-mfpmath=387")),
+    *((cc, flag, REFUSED) for cc in ("gcc", "clang") for flag in ("-Ofast", "-O2 -ffinite-math-only")),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def a_strangers(tmp_path_factory):
+    return export_c(ALL["KF-OPC limiter"](), tmp_path_factory.mktemp("anc")).path
+
+
+@pytest.mark.parametrize(
+    ("command", "flags", "told"),
+    [pytest.param(*one, marks=() if one[1] in ("-O3 -march=native", "-Ofast") else pytest.mark.slow) for one in FLAGS],
+)
+def test_with_any_flags_the_bits_are_those_of_python_or_it_is_told(command, flags, told, a_strangers, tmp_path):
+    options, main = [tool(command), *flags.split()], tmp_path / "main"
+    (tmp_path / "c.c").write_text("#include <math.h>\nint main(void) { return 0; }\n")
+    if subprocess.run([*options, tmp_path / "c.c", "-o", main], capture_output=True).returncode:
+        pytest.skip("the compiler does not know these flags, or has no C library for them")
+    made = subprocess.run(
+        [*options, a_strangers.with_name("main.c"), a_strangers, "-lm", "-o", main], capture_output=True, text=True
+    )
+    if told == REFUSED:
+        assert made.returncode != 0
+        assert REFUSED in made.stderr
+        return
+    assert (made.returncode, made.stderr) == (0, "")
+    said = subprocess.run([str(main)], capture_output=True, text=True).stdout
+    assert said.startswith("100 samples, ") or said == f"{told}\n" != "\n"
 
 
 def test_a_name_cannot_end_the_comment_that_it_stands_in(tmp_path):
