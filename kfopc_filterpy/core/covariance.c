@@ -60,8 +60,7 @@ static real largest_variance(const covariance *c)
 /* Return whether P and h'P h stay finite in a prediction from variances of at most `bound`. */
 static int stays_finite(const covariance *c, real bound, real fading, real r, real energy)
 {
-    const real diagonal = fading * c->owed->diagonal + r;
-    const real variance = fading * c->owed->scale * bound + diagonal;
+    const real variance = fading * (bound + c->owed->diagonal) + r;
     return variance <= MOST && (real)c->n * variance * energy <= MOST; /* h'P h <= trace(P) h'h */
 }
 
@@ -77,14 +76,14 @@ void predict(covariance *c, real fading, real r)
     if (fading > 1) {
         const real most = owed->usual > 0 ? WIDEST * owed->usual : UNKNOWN * owed->largest;
         owed->release = (fading - 1) * RELEASE;
-        if (owed->scale * owed->bound > most) owed->bound = largest_variance(c);
-        if (owed->scale * owed->bound > most) {
+        if (owed->bound > most) owed->bound = largest_variance(c);
+        if (owed->bound > most) {
             const real noise = (fading - 1) * owed->usual;
-            fading = 1 - noise / (owed->scale * owed->bound);
+            fading = 1 - noise / owed->bound;
             r += noise;
         }
     }
-    owed->scale *= fading;
+    owed->scale = fading;
     owed->diagonal = fading * owed->diagonal + r;
 }
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 
-from kfopc_filterpy import Plant, diagonal_kf, fx_rls, simulate
+from kfopc_filterpy import Plant, diagonal_kf, fx_rls, kf_anc, simulate
 
 L = 6
 FS, PATH = 16000, np.array([0.0, 0.8, -0.3])
@@ -42,13 +45,49 @@ def test_diagonal_variances_stay_positive_and_a_silent_reference_tells_nothing()
     assert np.all(np.isfinite(controller.weights))
 
 
-def test_a_diagonal_step_that_would_be_too_large_is_left_out() -> None:
+@pytest.mark.parametrize("make", [diagonal_kf, kf_anc])
+def test_a_step_that_would_be_too_large_is_left_out(make: Any) -> None:
     """Without measurement noise, K = 1/x' for a first sample: a reference next to nothing asks for too much."""
-    controller = diagonal_kf(2, [1.0], state_noise=0.0, measurement_noise=0.0)
-    for x in (1e-160, 1e-60):  # of the first, even S underflows
+    controller = make(2, [1.0], state_noise=0.0, measurement_noise=0.0)
+
+    def after(x: float, e: float) -> tuple[float, np.ndarray]:
+        """Return the first weight and all variances."""
         controller.control_signal(x)
+        controller.update(e)
+        return controller.weights[0], controller.variances if make is diagonal_kf else np.diag(controller.covariance)
+
+    close: Any = {"abs": 1e-14}  # the Kalman filter's least state noise
+    for x in (1e-160, 1e-60):  # of the first, even S underflows
+        assert after(x, 1.0) == (0.0, pytest.approx([1.0, 1.0], **close))
+    assert after(1e-40, 1.0)[0] == pytest.approx(1e40)
+    assert after(1.0, 1e60)[0] == pytest.approx(1e40)  # d^ - w'x', times K = 1e40
+    for _ in range(4):  # both weights are known, and silence changes nothing
+        assert after(0.0, 1.0)[1] == pytest.approx([0.0, 0.0], **close)
+
+
+@pytest.mark.parametrize(
+    ("x", "variances", "refused"),
+    [
+        (1e-9, {"initial_variance": 1e301}, True),
+        (1e-9, {"initial_variance": 0.0, "state_noise": 1e301}, True),
+        (1e6, {"initial_variance": 1e290}, True),
+        (1e3, {"initial_variance": 1e290}, False),
+    ],
+)
+def test_a_covariance_that_could_overflow_is_refused(x: float, variances: dict[str, float], refused: bool) -> None:
+    """P above 1e300, or x'P x'."""
+    controller = kf_anc(1, [1.0], **{"state_noise": 0.0, "measurement_noise": 1.0} | variances)
+    controller.control_signal(x)
+    with pytest.raises(ValueError, match="P is too large") if refused else nullcontext():
         controller.update(1.0)
-        assert (controller.weights[0], controller.variances[0]) == (0.0, 1.0)
-    controller.control_signal(1e-40)
-    controller.update(1.0)
-    assert controller.weights[0] == pytest.approx(1e40)
+    np.testing.assert_allclose(controller.weights, [0.0 if refused else 1 / x])
+
+
+def test_a_variance_of_long_ago_refuses_no_loud_reference() -> None:
+    """Which x'P x' could overflow with: w = sum x d / (sum x^2 + q / P0), of two samples of 1 and one of 1e6."""
+    q, P0, x = 1e280, 1e290, np.array([1.0, 1.0, 1e6])
+    controller = kf_anc(1, [1.0], state_noise=0.0, measurement_noise=q, initial_variance=P0)
+    for sample in x:
+        y = controller.control_signal(sample)
+        controller.update(2.0 * sample - y)
+    np.testing.assert_allclose(controller.weights, 2.0 * (x @ x) / (x @ x + q / P0), rtol=1e-6)  # P0's rounding over q
