@@ -162,7 +162,11 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[np.ndarray, Pla
         raise ValueError("--secondary is needed: the impulse response from control signal to error microphone")
     only_errors = options.primary is None and options.disturbance is None
     if only_errors and not getattr(options, "feedback", False):
-        raise ValueError("--primary or --disturbance is needed: what arrives at the error microphone?")
+        name = options.noise
+        raise ValueError(
+            "--primary or --disturbance is needed: what arrives at the error microphone? If it is a channel of "
+            f"{name}, name both, as in {name}:0 --disturbance {name}:1"
+        )
     noise, primary, disturbance = files.channels(options.noise), None, None
     if options.primary is not None:
         primary = files.noise_paths(options.primary, "--primary", noise)
@@ -290,17 +294,20 @@ def calibration_of(options: argparse.Namespace, files: Files, n_microphones: int
     from ..signals.recordings import calibration_factor
 
     pascals, option = options.pascal_per_unit, "--pascal-per-unit"
-    if options.calibrator is not None:
-        if pascals is not None:
-            raise ValueError("--calibrator stands in place of --pascal-per-unit: leave out one of them")
-        option, pascals = "--calibrator", []
-        for path in options.calibrator:
-            pascals.append(calibration_factor(files.calibrator(path), options.calibrator_db))
     errors = options.disturbance or options.noise
     stated = {path: files.units[path] for path in (errors, *options.secondary) if path in files.units}
     if options.disturbance is None and options.primary is not None:
         del stated[errors]  # of the reference
     units = {one.partition("/")[0] for unit in stated.values() for one in unit.split(", ")} - {"1"}
+    if options.calibrator is not None:
+        if pascals is not None:
+            raise ValueError("--calibrator stands in place of --pascal-per-unit: leave out one of them")
+        option, pascals = "--calibrator", []
+        for path in options.calibrator:
+            tone = files.calibrator(path)
+            if {tone.unit} == units != {"Pa"}:  # volts, like the recordings: the factor is in pascals per volt
+                tone = replace(tone, unit="1")
+            pascals.append(calibration_factor(tone, options.calibrator_db))
     if len(units) > 1 or (pascals is not None and units == {"Pa"} and set(pascals) != {1.0}):
         is_in = ", ".join(f"{path} is in {unit}" for path, unit in stated.items() if unit != "1")
         scale = "" if pascals is None else f", but {option} gives {', '.join(f'{one:.4g}' for one in pascals)} Pa for 1"

@@ -303,7 +303,9 @@ def calibration_factor(
     level = as_number(level_db, "level_db", unit="dB")
     recording = calibrator if isinstance(calibrator, Recording) else read_recording(calibrator)
     if recording.unit != "1":
-        raise ValueError(f"calibrator must not be scaled yet, got {recording.unit}: read it without unit")
+        raise ValueError(
+            f"calibrator must not be scaled yet, got {recording.unit}: read it without unit, or remove the unit from its file"
+        )
     if channel is not None and recording.samples.ndim == 2:
         recording = replace(
             recording, samples=recording.samples[as_channel(channel, recording.samples, recording.name)]

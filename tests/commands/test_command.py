@@ -59,6 +59,7 @@ ERRORS = {
     "paths inspect S.wav --file-fs 8000": "--file-fs is for files that state no rate",
     "paths inspect untimed.npy --fs 8000": "for example with --file-fs 48000",
     # Channels.
+    "verdict stereo.wav --secondary S.wav --rated-power 1": "name both, as in stereo.wav:0 --disturbance stereo.wav:1",
     "verdict stereo.wav PATHS --rated-power 1": "choose a channel, as in stereo.wav:0",
     "verdict stereo.wav:2 PATHS --rated-power 1": "channel must be below the 2 channel(s) of stereo.wav, got 2",
     "verdict noise.wav --secondary S.wav --rated-power 1 --disturbance stereo.wav:1": "is channel 0 of noise.wav",

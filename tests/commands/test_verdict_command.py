@@ -115,6 +115,7 @@ def test_of_a_list_of_amplifiers_the_cheapest_that_is_enough_is_first(command, f
     [
         ("name,watt,price\na,1,1\n", [], "list.csv must have the headings name, watt, ohm, price, and a number"),
         ("name,watt,ohm,price\na,1,8,?\n", [], "each line: could not convert string to float: '?'"),
+        ("name,watt,ohm,price\na,1,8,nan\n", [], "each line: price must be finite, got nan"),
         ("name,watt,ohm,price\n", [], "list.csv lists no amplifier"),
         (
             "name,watt,ohm,price\na,1,8,1\n",
@@ -252,6 +253,21 @@ def test_a_calibrators_recording_gives_the_levels(command, folder):
     code, _, err = command("verdict", *options, "--pascal-per-unit", "2")
     assert code == 2
     assert "leave out one of them" in err
+
+
+@pytest.mark.parametrize(("unit", "message"), [("V", ""), ("Pa", "got V: read it without unit, or remove the unit")])
+def test_a_calibrators_recording_in_volts_gives_pascals_per_volt(unit, message, command, folder):
+    """What the microphone recorded must be in volts, too."""
+    tone = 0.5 * np.sqrt(2) * np.sin(2 * np.pi * 1000 * np.arange(FS) / FS)
+    for name, signal, own in (("noise", soundfile.read(folder / "noise.wav")[0], unit), ("calibrator", tone, "V")):
+        scipy.io.savemat(folder / f"{name}.mat", {"p": signal, "fs": FS, "unit": own})
+    scene = ["noise.mat", "--secondary", "S.wav", "--feedback", "--rated-power", "4", "--taps", "32", "--json"]
+    code, out, err = command("verdict", *scene, "--calibrator", "calibrator.mat")
+    assert message in err
+    if code != 2:
+        bands = np.array(json.loads(out)["levels"]["before_db"])
+        assert 10 * np.log10(np.sum(10 ** (bands / 10))) == pytest.approx(100.0, abs=0.3)  # as above
+    assert (code == 2) == bool(message)
 
 
 WAYS = {
