@@ -246,6 +246,8 @@ class _Reader:
 
     def __init__(self, content: bytes, classes: Iterable[type]) -> None:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            if sum(entry.file_size for entry in file.zip.infolist()) > len(content):  # `save` compresses nothing
+                raise ValueError("it would unpack to more than it has")
             self._arrays = dict(file)
         header = json.loads(self._arrays["header"].item())
         if header["version"] != _series():

@@ -220,6 +220,13 @@ def test_a_missing_and_another_file_are_refused(file: Path, tmp_path: Path) -> N
         Mine().save(tmp_path / "nowhere" / "run.npz")
 
 
+def test_a_file_that_would_unpack_to_far_more_than_it_has_is_refused(tmp_path: Path) -> None:
+    archived = io.BytesIO()
+    np.savez_compressed(archived, header=np.zeros(10_000_000))
+    with pytest.raises(ValueError, match=r"x\.npz is not continued .*it would unpack to more than it has"):
+        CoreController.load(sealed(tmp_path / "x.npz", archived.getvalue()))
+
+
 def test_another_version_is_refused_by_its_number(file: Path) -> None:
     path = forged(file, lambda header: header | {"version": "0.9"})
     with pytest.raises(ValueError, match=r"not continued by this version .* by version 0\.9, and this is 1\.0"):

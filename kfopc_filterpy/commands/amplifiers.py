@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .._validate import as_number
 from .inputs import ratings_of
 from .options import refuse_unused
 
@@ -25,14 +26,17 @@ def amplifiers_in(path: str) -> list[list[Any]]:
     from ..signals.content import require_file
 
     require_file(path)
-    lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    comma = "," if ";" in lines[0] else "."  # of decimals
     try:
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+        comma = "," if ";" in lines[0] else "."  # of decimals
         rows = [
             [cell.strip() for cell in row] for row in csv.reader(lines, delimiter=";" if comma == "," else ",") if row
         ]
         places = [next(i for i, one in enumerate(rows[0]) if one.lower().startswith(column)) for column in COLUMNS]
-        found = [[row[places[0]], *(float(row[i].replace(comma, ".")) for i in places[1:])] for row in rows[1:]]
+        found = [
+            [row[places[0]], *(as_number(float(row[i].replace(comma, ".")), rows[0][i]) for i in places[1:])]
+            for row in rows[1:]
+        ]
     except (StopIteration, IndexError, ValueError) as error:
         raise ValueError(
             f"{path} must have the headings {', '.join(COLUMNS)}, and a number in the last three of each line: {error}"

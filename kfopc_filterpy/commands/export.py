@@ -76,7 +76,7 @@ def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | Non
     require_file(path)
     try:
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not TOML: {error}") from error
     make = CORE[as_choice(settings.pop("algorithm", None), f"algorithm in {path}", CORE)]
     given_fs = settings.pop("fs", None)

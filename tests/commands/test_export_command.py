@@ -38,7 +38,7 @@ SETTINGS = {
 
 def described(**settings):
     """Return a settings file."""
-    return "\n".join(f"{name} = {str(value).lower() if value is True else value!r}" for name, value in settings.items())
+    return "\n".join(f"{name} = {'true' if value is True else repr(value)}" for name, value in settings.items())
 
 
 def same_as_of_python(controller, made, folder, dtype="float64"):
@@ -140,6 +140,8 @@ WRONG = {
     "bad setting": (GOOD | {"step_size": -1.0}, "", "c.toml: step_size must be greater than 0, got -1"),
     "missing setting": ({"algorithm": "FxLMS", "n_taps": 8}, "", "c.toml: .*missing.*'secondary'"),
     "no TOML": ({}, "algorithm: FxLMS", "c.toml is not TOML: "),
+    "no end of brackets": ({}, "x = " + 5000 * "[", "c.toml is not TOML: "),
+    "a truth for a number": (GOOD | {"n_taps": True}, "", "c.toml: n_taps must be a whole number, got True"),
     "no path": (GOOD | {"secondary": []}, "", "secondary must be taps or names of files, got an empty list"),
     "missing file": (GOOD | {"secondary": "none.wav"}, "", "none.wav"),
     "two budgets": (RATED_TWICE, "[constraint]\nrated_power = 1.0", "give either rated_power= or constraint="),
