@@ -144,9 +144,11 @@ def timed_once(task: Task, command: CommandController) -> tuple[SimulationResult
 
 def run_task(runs: Runs, task: Task, entries: Mapping[str, Entry], only: str = "*") -> dict[str, Any]:
     """Return the scores of all entries of a task, the best within the rating first, and its bound."""
+    chosen = {name: own for name, own in entries_for(task, entries).items() if fnmatch(name, only)}
+    if not chosen:
+        raise LeftOut(f"no entry fits {only}")
     bound_db = task.bound_db()
     _, reference_s = timed(lambda: task.run(make_controller(task, *REFERENCE), JUDGED))
-    chosen = {name: own for name, own in entries_for(task, entries).items() if fnmatch(name, only)}
     scores = [run_entry(runs, task, name, own, bound_db, reference_s) for name, own in chosen.items()]
     scores.sort(key=lambda one: (bool(one.failed), not one.within_rating, -one.noise_reduction_db))
     return {"task": task, "bound_db": bound_db, "scores": scores}
@@ -218,18 +220,22 @@ def main(arguments: Sequence[str], objects: Mapping[str, Algorithm] | None = Non
     except OSError as error:
         parser.error(str(error))
     entries: dict[str, Entry] = {**(objects or {}), **commands}
+    known: dict[str, Entry] = {}
     runs, outcomes = Runs(), []
     with one_blas_thread(), warnings.catch_warnings():  # as in the runs that are timed
         warnings.simplefilter("ignore", RuntimeWarning)  # of filters that diverge while they are tuned
         for path in files:
             try:
                 task = read_task(path)
-                others = {**rivals(), **(peers() if task.other_packages else {})}
-                outcomes.append(run_task(runs, task, {**others, **entries}, options.only))
+                others = {**rivals(), **(peers() if task.other_packages else {}), **entries}
+                known |= entries_for(task, others)
+                outcomes.append(run_task(runs, task, others, options.only))
             except LeftOut as error:
                 print(f"{path.stem}: left out, {error}\n", flush=True)
                 continue
             print(f"{table(outcomes[-1])}\n", flush=True)
+    if not outcomes:
+        parser.error(f"no task was run; the entries that --only can name are {', '.join(known)}")
     found = {
         outcome["task"].name: {
             "digest": outcome["task"].digest,

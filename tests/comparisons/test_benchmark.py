@@ -293,9 +293,13 @@ def test_what_a_command_has_started_ends_with_it(short: Task, tmp_path: Path) ->
     [
         (["--tasks", "none"], "no task fits none; there are bandpass"),
         (["--entry", "name"], "--entry must be NAME=COMMAND"),
+        (
+            ["--only", "KF-BP", "--tasks", "bandpass"],
+            "no task was run; the entries that --only can name are KF-ANC, KF-OPC",
+        ),
     ],
 )
-def test_the_command_line_says_what_is_wrong(arguments: list[str], says: str, capsys) -> None:
+def test_the_command_line_says_what_is_wrong(arguments: list[str], says: str, inside: Path, capsys) -> None:
     with pytest.raises(SystemExit):
         study.main(arguments)
     assert says in capsys.readouterr().err
