@@ -32,9 +32,9 @@ def run(controller: Any, x: np.ndarray, secondary: Any = S, **options: Any) -> A
     return simulate(controller, x, Plant(secondary, PRIMARY, fs=FS, sensor_noise_std=0.01), rng=1, **options)
 
 
-def worst_mean(y: np.ndarray) -> float:
+def worst_mean(y: np.ndarray, averaging_s: float = AVERAGING_S) -> float:
     """The largest mean power over the averaging time, within the run."""
-    n = round(AVERAGING_S * FS / BLOCK) * BLOCK
+    n = round(averaging_s * FS / BLOCK) * BLOCK
     total = np.concatenate([[0.0], np.cumsum(y**2)])
     return float(np.max(total[n:] - total[:-n]) / n)
 
@@ -80,12 +80,13 @@ def test_it_learns_both_paths() -> None:
 # ---- Runs
 
 
-def test_the_power_is_kept_over_any_averaging_time_and_used() -> None:
+@pytest.mark.parametrize("averaging_s", [0.64, AVERAGING_S, 10.0])  # 20 blocks are the least
+def test_the_power_is_kept_over_any_averaging_time_and_used(averaging_s: float) -> None:
     x = noise(16.0)
     x[round(6 * FS) : round(8 * FS)] *= 3.0
-    controller = made()
+    controller = made(averaging_s=averaging_s)
     result = run(controller, x)
-    assert worst_mean(result.control_signal) < 1.05 * 0.25
+    assert worst_mean(result.control_signal, averaging_s) < 1.05 * 0.25
     assert output_power(result.control_signal[-round(3 * FS) :], steady=1.0) > 0.5 * 0.25
     assert noise_reduction_db(result.error, result.disturbance) > 2.0
 
@@ -105,8 +106,10 @@ def test_a_rated_power_that_is_assigned_during_a_run_holds_from_then_on() -> Non
 # ---- Verification
 
 
-def test_a_path_whose_polarity_flips_raises_an_alarm_and_is_learnt_again() -> None:
-    controller = made(rated_power=1.0)
+@pytest.mark.parametrize("averaging_s", [0.64, AVERAGING_S, 10.0])
+def test_a_path_whose_polarity_flips_raises_an_alarm_and_is_learnt_again(averaging_s: float) -> None:
+    """However long the power is averaged, which is another time than that in which the plant is known."""
+    controller = made(rated_power=1.0, averaging_s=averaging_s)
     run(controller, noise(6.0))
     result = run(controller, noise(12.0, 1), -S)
     assert controller.alarms >= 1
