@@ -75,6 +75,9 @@ def replacing_files(folder: Path) -> Iterator[Path]:
     try:
         yield made
         names = [path.relative_to(made) for path in made.rglob("*") if path.is_file()]
+        for place in (folder / name for name in names):
+            if place.exists() and not place.is_file():
+                raise FileExistsError(f"{place} is there and is no file: remove it, or choose another folder")
         for name in sorted(names, key=lambda name: len(name.parts), reverse=True):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             os.replace(made / name, folder / name)

@@ -76,6 +76,13 @@ def test_every_python_that_is_started_ignores_the_current_folder():
     assert [one for one in started if one[1] != '"-P"'] == []
 
 
+def test_no_test_looks_at_a_wall_clock():
+    """On a busy machine it would fail. CPU time may be measured, and a sound card's time is real."""
+    clock = re.compile(r"\b(sleep|perf_counter|monotonic|time\.time|datetime\.now)\(")
+    found = {path.name for path in (ROOT / "tests").rglob("*.py") if clock.search(path.read_text(encoding="utf-8"))}
+    assert found == {"test_jack.py"}
+
+
 PARTS = [
     *("filters", "power", "controllers", "paths", "signals", "bounds"),
     *("metrics", "export", "realtime", "plot", "verdict"),

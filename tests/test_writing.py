@@ -119,6 +119,11 @@ def test_what_is_no_file_stays_what_it_is(tmp_path: Path) -> None:
     assert pipe.is_fifo()
     write_wav(tmp_path / "file.wav", np.ones(500), FS)
     assert got == (tmp_path / "file.wav").read_bytes()
+    os.mkfifo(tmp_path / "anc.c")
+    with pytest.raises(FileExistsError, match=r"anc\.c is there and is no file"):  # which come together
+        WRITERS["anc.c"](tmp_path)
+    assert (tmp_path / "anc.c").is_fifo()
+    assert not (tmp_path / "anc.h").exists()
     if Path("/dev/full").exists():
         link = tmp_path / "full.wav"
         link.symlink_to("/dev/full")
