@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import toeplitz
 
 from kfopc_filterpy import Plant, diagonal_kf, fx_rls, kf_anc, simulate
+from kfopc_filterpy.paths import PathTolerance
 
 L = 6
 FS, PATH = 16000, np.array([0.0, 0.8, -0.3])
@@ -66,21 +67,26 @@ def test_a_step_that_would_be_too_large_is_left_out(make: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("x", "variances", "refused"),
+    ("x", "options", "refused"),
     [
         (1e-9, {"initial_variance": 1e301}, True),
         (1e-9, {"initial_variance": 0.0, "state_noise": 1e301}, True),
-        (1e6, {"initial_variance": 1e290}, True),
-        (1e3, {"initial_variance": 1e290}, False),
+        (1e6, {"initial_variance": 1e290}, True),  # at one microphone
+        (4e4, {"initial_variance": 1e290}, False),
+        (4e4, {"initial_variance": 1e290, "guarded": True}, True),  # whose filter has a gain of 5.7
     ],
 )
-def test_a_covariance_that_could_overflow_is_refused(x: float, variances: dict[str, float], refused: bool) -> None:
-    """P above 1e300, or x'P x'."""
-    controller = kf_anc(1, [1.0], **{"state_noise": 0.0, "measurement_noise": 1.0} | variances)
-    controller.control_signal(x)
-    with pytest.raises(ValueError, match="P is too large") if refused else nullcontext():
-        controller.update(1.0)
-    np.testing.assert_allclose(controller.weights, [0.0 if refused else 1 / x])
+def test_a_covariance_that_could_overflow_is_refused(x: float, options: dict[str, Any], refused: bool) -> None:
+    """P above 1e300, or n P x'x'."""
+    guarded = options.pop("guarded", False)
+    settings: dict[str, Any] = {"state_noise": 0.0, "measurement_noise": 1.0} | options
+    for path in np.array([[[[1e-3]], [[1.0]]], [[[1.0]], [[1e-3]]]]):
+        controller = kf_anc(1, path, n_references=2, **settings)
+        controller.secondary_path_uncertainty = PathTolerance(gain_db=20.0) if guarded else None
+        controller.control_signal([x, x])
+        with pytest.raises(ValueError, match="P is too large") if refused else nullcontext():
+            controller.update(path.ravel())
+        np.testing.assert_allclose(controller.weights.ravel(), 0.0 if refused else 0.5 / x)
 
 
 def test_a_variance_of_long_ago_refuses_no_loud_reference() -> None:

@@ -37,6 +37,11 @@ def test_soft_saturation_far_above_its_limit_is_the_limit(sharpness):
         assert SoftSaturationAmplifier(0.5, sharpness)(-y) == pytest.approx(-0.5, rel=1e-5)
 
 
+@pytest.mark.parametrize("sharpness", [1e-7, 1e-3, 1e6, 1e9])
+def test_soft_saturation_at_its_limit(sharpness):
+    assert SoftSaturationAmplifier(0.5, sharpness)(0.5) == pytest.approx(0.5 * 2 ** (-0.5 / sharpness), rel=1e-12)
+
+
 @pytest.mark.parametrize("amplifier", make(0.7, 2.5))
 def test_numbers_and_arrays_of_any_shape(amplifier):
     values = np.linspace(-3, 3, 12)
