@@ -169,3 +169,13 @@ def test_weights_that_were_learned_of_hardly_anything_begin_anew() -> None:
         assert before[0] > 1.0
         made.control_signal(louder * 1e-3)
         np.testing.assert_array_equal(made.weights, [0.0] if forgets else before)
+
+
+def test_from_silence_nothing_is_learned() -> None:
+    """FxNLMS: weights of 20 samples are kept, 20 times as long as those of a soft reference would be."""
+    made = fx_nlms(1, [1.0], step_size=0.1)
+    made.process(np.full(20, 2.0), np.ones(20))
+    before = made.weights
+    made.process(np.zeros(20_000), np.zeros(20_000))
+    made.control_signal(1.0)
+    np.testing.assert_array_equal(made.weights, before)

@@ -1,7 +1,10 @@
 """What must hold of the loop for any signal, its pieces, and filterpy's own filters in it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import scipy.signal
 from helpers.comparing import SIGNALS, assert_same_run
 from helpers.controllers import ALL, MAKERS
 from helpers.loop import FS, MEMORY_S, MU, N_TAPS, S_HAT, Q, R, S, noises, run
@@ -37,6 +40,14 @@ def test_pieces_of_the_compiled_loop_do_not_show(name):
 
 
 # ---- What must hold for any signal
+
+
+def test_feedback_of_one_sample_is_a_recursion():
+    """y(n) = x(n) + 0.5 y(n - 1), of a controller that passes its reference."""
+    through = SimpleNamespace(name="through", control_signal=lambda x: x, update=lambda e: None)
+    x, d, _ = noises(200, 0)
+    result = simulate(through, x, Plant([1.0], feedback=[0.0, 0.5], fs=FS), disturbance=d)
+    np.testing.assert_allclose(result.control_signal, scipy.signal.lfilter([1.0], [1.0, -0.5], x), rtol=0, atol=1e-13)
 
 
 @given(exponent=st.integers(-20, 20), seed=st.integers(0, 1000))

@@ -27,7 +27,7 @@ def test_the_result():
     assert result.weights is result.weights_time_s is None  # not asked for
 
 
-@pytest.mark.parametrize("every", [1, 7, 299, 300, 1000])
+@pytest.mark.parametrize("every", [1, 2, 7, 299, 300, 1000])
 def test_weights_are_recorded_after_samples_0_k_2k(every):
     whole, result = (simulate(MAKERS["KF-OPC"](), X, PLANT, disturbance=D, record_weights_every=k) for k in (1, every))
     np.testing.assert_array_equal(result.weights, whole.weights[::every])

@@ -26,6 +26,8 @@ ROOT = Path(__file__).resolve().parents[2]
 EVERY = "tests/controllers/test_every_controller.py::test_"
 CONTROLLERS = (  # the quickest first
     "tests/controllers/test_against_oracles.py",
+    "tests/core/test_core_refusals.py::test_a_setting_without_an_upper_limit_may_be_large",
+    f"{EVERY}a_run_is_the_steps_bit_for_bit",
     f"{EVERY}blocks_are_the_steps_bit_for_bit",
     f"{EVERY}runs_together_are_the_runs_one_by_one",
     f"{EVERY}a_refused_sample_leaves_the_state_as_it_was",
@@ -37,7 +39,10 @@ KALMAN = (
     "tests/filters/test_random_walk.py",
     *CONTROLLERS,
 )
-LOOP = ("tests/loop/test_loop.py", "tests/loop/test_channels.py", "tests/loop/test_changes_in_a_run.py")
+LOOP = tuple(
+    f"tests/loop/test_{name}.py"
+    for name in ("loop", "channels", "changes_in_a_run", "simulation", "several_controllers")
+)
 IN_C = "not frequency"  # whose filter is Python's
 TESTS = {  # which, as pytest's -k says it, and of which files
     "amplifier.c": (IN_C, "tests/power/test_amplifiers.py"),
