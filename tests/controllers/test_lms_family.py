@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from kfopc_filterpy import (
     Plant,
+    fx_lms,
     fx_nlms,
     leaky_fx_lms,
     mov_fx_lms,
@@ -23,6 +24,7 @@ from kfopc_filterpy import (
     two_gradient_fx_lms,
 )
 from kfopc_filterpy.controllers import penalty_factor
+from kfopc_filterpy.paths import PathTolerance
 
 L, FS = 5, 16000.0
 PATH = np.array([0.0, 0.8, -0.3, 0.1])  # true secondary path
@@ -179,3 +181,49 @@ def test_from_silence_nothing_is_learned() -> None:
     made.process(np.zeros(20_000), np.zeros(20_000))
     made.control_signal(1.0)
     np.testing.assert_array_equal(made.weights, before)
+
+
+# ---- Limits
+
+
+def test_a_large_step_takes_no_more_than_the_whole_error_or_control_signal() -> None:
+    made = fx_lms(1, [1.0], step_size=1.0)
+    made.control_signal(1e15)
+    made.update(1e25)
+    np.testing.assert_allclose(made.weights, [1e10], rtol=1e-12)
+    made = mov_fx_lms(1, [[[1.0], [1.0]]], step_size=1e-3, penalty_factor=[0.0, 1e30])
+    for error in (1.0, 0.0):
+        made.control_signal(1.0)
+        made.update([error])
+    np.testing.assert_allclose(made.weights.ravel(), [1e-3, 0.0], atol=1e-18)
+
+
+@pytest.mark.parametrize("loud", [0, 1])
+def test_a_step_above_1e50_is_refused(loud: int) -> None:
+    made = fx_lms(1, [[[1.0]], [[1.0]]], step_size=1.0)
+    made.control_signal(1e10)
+    with pytest.raises(ValueError, match="step"):
+        made.update(np.eye(2)[loud] * 1e62)  # over 2 x'
+    np.testing.assert_array_equal(made.weights.ravel(), [0.0])
+
+
+def test_a_guard_that_would_take_more_than_1e50_is_refused() -> None:
+    made = fx_lms(1, [1.0], step_size=1.0)
+    for error in (0.9e50, 0.9e50, 0.0):
+        made.control_signal(1.0)
+        if error:
+            made.update(error)
+    made.secondary_path_uncertainty = PathTolerance(gain_db=20.0)  # 0.97 of the weights would go
+    with pytest.raises(ValueError, match="step"):
+        made.update(0.0)
+    np.testing.assert_allclose(made.weights, [1.8e50])
+
+
+@pytest.mark.parametrize("at", [*np.ndindex(2, 3)])
+def test_the_loudest_reference_is_1e25_over_the_largest_gain_of_a_path(at: tuple[int, int]) -> None:
+    path = np.zeros((2, 3, 2))
+    path[at] = 6.0, -4.0
+    made = fx_lms(1, path, step_size=1.0)
+    made.control_signal(0.9e24)
+    with pytest.raises(ValueError, match="reference"):
+        made.control_signal(1.1e24)

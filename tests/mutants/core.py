@@ -67,6 +67,7 @@ TESTS = {  # which, as pytest's -k says it, and of which files
     "processor.c": (IN_C, "tests/core/test_building.py::test_the_level_is_that_of_the_features"),
     "signals.c": (
         IN_C,
+        "tests/controllers/test_lms_family.py",
         "tests/controllers/test_internal_model.py",
         "tests/controllers/test_new_secondary_path.py",
         "tests/controllers/test_uncertain_path.py",
