@@ -74,7 +74,8 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
     They raise nearly anything: zlib.error, struct.error, IndexError, KeyError, NotImplementedError, MemoryError.
     """
     try:
-        yield
+        with np.errstate(over="ignore", invalid="ignore"):  # numbers up to 1e308, which are refused or taken
+            yield
     except ModuleNotFoundError:
         raise
     except Exception as error:

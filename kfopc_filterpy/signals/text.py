@@ -13,7 +13,7 @@ import numpy as np
 from .content import LEAST_SURE_RATE, NO_SIGNAL, Content, agreed_rate, even_step, rate_of_step, rounding_of
 
 _LONGEST_HEADER = 100  # lines
-_LONGEST_STATEMENT = 500  # characters of a line, in which a rate or a unit of time is looked for
+_LONGEST_STATEMENT = 500  # characters of a line, in which a rate or a unit is looked for
 _END, _ENOUGH = 4096, 20  # bytes and lines at the end by which a file that was cut is recognised
 _TEKTRONIX = re.compile(
     r'"?Record Length"?(,[^,]*){4}'
@@ -97,7 +97,7 @@ def stated_rate(path: str | os.PathLike[str], header: list[str]) -> float | None
 
 def unit_of(heading: str) -> tuple[float, str] | None:
     """Return the factor to a unit without prefix, and the unit, at the end of a heading: 1e-3 and "Pa" for "p (mPa)"."""
-    found = _UNIT.search(heading)
+    found = _UNIT.search(heading[:_LONGEST_STATEMENT])
     if found is None:
         return None
     unit = re.sub("^[Vv]olts?$", "V", re.sub("^[Pp]ascals?$", "Pa", found[2])) + (f"/{found[4]}" if found[4] else "")

@@ -390,6 +390,9 @@ STATED = [
      r"x\.txt .* of a frequency response or a microphone's calibration file, export"),
     ("x.csv", rows(lambda n: f"{n / 50000:.4f},1"), {}, r"rises in uneven steps, from 0 to 0\.0001: export .* all digits"),
     ("x.csv", rows(lambda n: f"{n // 2 / 25000:.6f},1"), {}, "rises in uneven steps"),  # the least and the largest of each
+    ("x.csv", "p (kPa)\n1e308\n", {"fs": FS}, r"x\.csv must be finite"),
+    ("x.csv", "0 1\n1 2\ninf 3\n", {"fs": FS}, r"x\.csv must be finite"),
+    ("x.csv", "-1.7e308 1\n0 2\n1.7e308 3\n", {"fs": FS}, (FS, "1", [[-1.7e308, 0, 1.7e308], [1, 2, 3]])),
     ("x.csv", rows(lambda n: f"{20 * n},0.5"), {}, r"rises in steps of 20 without a unit: .* \"Time \(ms\)\""),
     ("x.csv", rows(lambda n: f"{n / 50000:.6f},1.#INF"), {}, r"x\.csv is text that is no numbers"),
     ("x.csv", rows(lambda n: f"{n / 50000:.6f},{'1.#INF' if n == 200 else 1}"), {}, r"damaged or cut short, .*'1\.#INF' .* at row 200"),
