@@ -95,6 +95,31 @@ def test_under_sanitizers(name: str, real: str, plans: list[tuple[str, ...]], tm
         ran(made, *arguments, UBSAN_OPTIONS="print_stacktrace=1")
 
 
+@pytest.mark.parametrize(
+    ("shape", "name", "most"),
+    [
+        ({}, "guard_taps", 48),
+        ({}, "taps", 33_554_316),  # (I + KJ) (4 (L + M) + 448) is at most 2^28
+        ({"microphones": 2}, "taps", 22_369_505),
+        ({"microphones": 16, "loudspeakers": 16, "references": 16}, "taps", 16_320),  # KJI (4 L + 256)
+        ({"scenarios": 2**11, "loudspeakers": 2, "references": 2}, "taps", 2**15),  # SJIL
+        ({"scenarios": 2**20}, "microphones", 2**8),  # SK
+        ({"scenarios": 2**19, "loudspeakers": 2}, "path_taps", 48),  # SJ (4 M + 64)
+        ({"loudspeakers": 2, "limiter_windows": (1, 1)}, "power_windows", 44_739_242),  # 3 SJN
+        ({"loudspeakers": 2, "power_windows": (0, 0)}, "limiter_windows", 44_739_242),
+        ({"scenarios": 1, "microphones": 1, "modelled": 1}, "scenarios", 1),
+        ({"references": 2, "modelled": 1}, "microphones", 2),
+    ],
+)
+def test_the_largest_shape_is_taken_and_no_larger_or_empty_one(shape: dict[str, Any], name: str, most: int) -> None:
+    plain = {"microphones": 1, "loudspeakers": 1, "references": 1, "taps": 8, "path_taps": 4} | shape
+    least = 0 if name in ("guard_taps", "power_windows") else 1
+    for number in (least - 1, least, most, most + 1):
+        values = [(number, least), (least, number)] if name.endswith("windows") else [number]
+        for value in values:
+            assert bool(Algorithm("fxlms").shapes(Shape(**plain | {name: value}))) == (least <= number <= most)
+
+
 def test_settings_are_in_the_order_of_the_c_file() -> None:
     for name in known():
         assert [one.name for one in Algorithm(name).settings] == list(ALGORITHMS[name])

@@ -58,9 +58,9 @@ TESTS = {  # which, as pytest's -k says it, and of which files
     "kalman.c": KALMAN,
     "limiter.c": (
         IN_C,
-        "tests/core/test_core_refusals.py",
         "tests/power/test_limiter.py",
         "tests/realtime/test_limiter_promise.py",
+        "tests/core/test_core_refusals.py",
     ),
     "lms.c": ("not KF and not RLS and not frequency", "tests/controllers/test_lms_family.py", *CONTROLLERS),
     "loop.c": (IN_C, *LOOP, *CONTROLLERS),
