@@ -60,6 +60,7 @@ TESTS = {  # which, as pytest's -k says it, and of which files
         IN_C,
         "tests/power/test_limiter.py",
         "tests/realtime/test_limiter_promise.py",
+        "tests/controllers/test_against_oracles.py",
         "tests/core/test_core_refusals.py",
     ),
     "lms.c": ("not KF and not RLS and not frequency", "tests/controllers/test_lms_family.py", *CONTROLLERS),
