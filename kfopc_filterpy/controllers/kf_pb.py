@@ -31,16 +31,12 @@ POSTERIOR = (
     "fits",
     "theta",
     "noise",
-    "draws",
     "data",
     "data_of_errors",
     "error_energy",
-    "factor",
-    "inverse_diagonal",
-    "set_aside_of_errors",
-    "set_aside_energy",
-    "path_correlation",
-    "cross_correlation",
+    "before_data",
+    "solution",
+    "prior_draws",
 )
 
 
@@ -148,8 +144,8 @@ def kf_pb(
     the power of the error by less than half of the measurement noise.
 
     Both paths are verified while they are used. If the errors contradict the posterior, the plant has changed, and all
-    that was learned is forgotten. If the control then does more harm than good, the loudspeakers are silent until both
-    paths are learned again: one or two blocks for short paths. If a new `secondary` is assigned, the posterior begins
+    that was learned is forgotten. If the control then does more harm than good, the loudspeakers are silent for a block
+    or two, until both paths are learned again. If a new `secondary` is assigned, the posterior begins
     anew, too. The account stays, and the control filter stays until the first solution.
 
     Parameters
@@ -193,10 +189,10 @@ def kf_pb(
 
     Notes
     -----
-    The posterior is computed again when an eighth of the data is new, or of the energies in it. This takes
-    :math:`O((IN + JM)^3)` operations, which are spread over as many blocks as they need; a secondary path has M taps,
-    and a primary one N = L + M - 1. The posterior forgets over 5 s. `listen` learns the primary paths
-    before the control is switched on.
+    After each block, a few steps of conjugate gradients approach the posterior and the control filters of all
+    loudspeakers, from those of the last block. Their products are fast Fourier transforms of at least 2N samples; a
+    secondary path has M taps, and a primary one N = L + M - 1. The posterior forgets over 5 s. `listen` learns the
+    primary paths before the control is switched on.
 
     References
     ----------
@@ -236,7 +232,7 @@ def kf_pb(
             "block": block,
             "averaging": max(round(samples / block), LEAST_BLOCKS),
             "window": math.exp(-1.0 / min(samples / WINDOWS, WINDOW_S * fs)),
-            "memory": math.exp(-block / (MEMORY_S * fs)),
+            "memory": math.exp(-1 / (MEMORY_S * fs)),
             "spread": relative_spread(secondary_path_uncertainty, paths),
         },
         n_references=n_references,

@@ -1,14 +1,15 @@
-/* KF-PB: a posterior of the plant, the control filter of least expected error, and one price of
- * power a loudspeaker.
+/* KF-PB: a posterior of the plant, the control filters of least expected error, and a price of
+ * power for each loudspeaker.
  *
  *     y = v * x            asked of the loudspeakers
  *     e = p * x - s * y    heard by the microphones, and noise
  *
  * After every block of B samples, the posterior of p and s takes the block (posterior.c). Then the
- * filter of each loudspeaker in turn becomes the one of least expected error at the price of its
- * power, (A + price R) v = b: A is the correlation of its filtered references, R that of the
- * references, b theirs with what the others leave of the disturbance. N = L + M - 1 taps of a
- * primary path are all that control can reach; `lags` is L + N. C_ab(l) = E[a(t) b(t - l)]. */
+ * filters of all loudspeakers become those of least expected error at the prices of their powers,
+ * (A + price R) v = b: A is the correlation of the filtered references, R that of the references, b
+ * theirs with the disturbance. Both are Toeplitz for each pair of filters. A few steps of conjugate
+ * gradients from the last solution approach the filters, and two steps of Newton's method the
+ * prices. N = L + M - 1 taps of a primary path are all that control can reach. */
 #include "posterior.h"
 
 enum { RATED_POWER, BLOCK, AVERAGING, WINDOW, MEMORY, SPREAD };
@@ -26,10 +27,9 @@ static const anc_setting budget_settings[] = {{"rated_power", 1e-30f, 0, ANC_EAC
 static const real CHEAPER = 4, CHEAPEST = (real)0.7;
 /* A rating of power must save at least this share of the noise. */
 static const real WORTHWHILE = 0.5f;
-/* Of the power that a price is to yield. */
-static const real NEAR = (real)0.005;
-/* Shares of the account: what a filter may always spend; what is never exceeded, but clipped. */
-static const real LEAST_SHARE = (real)0.02, MOST = (real)1.04;
+/* Shares of the account: what a filter may always spend; what is planned, a little more than all,
+ * since a noise that fluctuates spends less; what is never exceeded, but clipped. */
+static const real LEAST_SHARE = (real)0.02, PLANNED = (real)1.02, MOST = (real)1.04;
 /* The account must afford the power of the last window of x for this part of the averaging time,
  * and that of the last block for this one. */
 enum { WINDOW_LASTS = 4, BLOCK_LASTS = 20 };
@@ -39,9 +39,12 @@ enum { SHORTER = 5 };
 /* A sound does not grow by more than this from one sample to the next, but a click in a reference
  * does. */
 static const real GROWTH = 10;
-enum { NEWTON = 20 }; /* steps */
-/* No filter has a larger tap. REGULAR: share of the diagonal that is added to it, so that rounding
- * leaves the matrix definite. */
+/* Steps of conjugate gradients towards filters, and of the prices, in a block. */
+enum { FILTER_STEPS = 6, PRICE_STEPS = 2 };
+/* A price rises by at most so many times itself in a step. */
+static const real PRICE_RISES = 3;
+/* No filter has a larger tap. REGULAR: share of the powers of x that is added to them, and of the
+ * paths' gains that is added to the prices, so that rounding leaves the matrix definite. */
 #ifdef ANC_FLOAT
 static const real LARGEST_TAP = 1e6f, REGULAR = 1e-5f, LEAST_POWER = 1e-30f;
 #else
@@ -51,28 +54,30 @@ static const real LARGEST_TAP = 1e50, REGULAR = 1e-7, LEAST_POWER = 1e-300;
 typedef struct {
     signals s;
     posterior posterior;
-    int32_t T, lags;       /* T: blocks of the account */
-    real *asked;           /* (3, J) now; sum of squares of the block; the most it may become */
-    real *peak;            /* (I) largest magnitude of x of late */
-    int32_t *controlled;   /* whether control was on in the block */
-    real *R, *short_R;     /* (I, I, lags), (I, I, L) windowed sums of x_i(t) x_a(t - l) */
-    real *weight;          /* (2) of these windows */
-    real *book;            /* (T, J) power of each block over the rating, newest first */
-    real *price, *steady;  /* (J); (J) the price that spends the rating */
-    real *C;               /* (I, I, 2 lags - 1) of the references, both signs of l */
-    real *A;               /* (J, I, J, I, 2L - 1) of the filtered references */
-    real *b;               /* (J, I, L) of these with d */
-    real *sums;            /* (I, I, 2L - 1) A + price R of one loudspeaker */
-    real *predictors;      /* (L rows of I, I, 1 to L) see `factorise` */
-    real *forward, *small; /* (I, I, L), (L + 6, I, I) see `factorise` */
-    real *vectors;         /* (VECTORS_OF_TAPS, I, L) */
-    real *work;            /* (WORKS, width) */
+    int32_t T;                /* blocks of the account */
+    real *asked;              /* (3, J) now; sum of squares of the block; the most it may become */
+    real *peak;               /* (I) largest magnitude of x of late */
+    int32_t *controlled;      /* whether control was on in the block */
+    real *R, *short_R;        /* (I, I, N) windowed sums of x_i(t) x_a(t - l) */
+    real *weight;             /* (2) of these windows */
+    real *book;               /* (T, J) power of each block over the rating, newest first */
+    real *price, *steady;     /* (J); (J) the price that spends the rating */
+    real *now, *at_steady;    /* (J, I, L) filters at these prices */
+    real *lags;               /* (I, I, N) of the windows, into which the newest block fades in */
+    real *R_at, *smooth_R;    /* (I, I) spectra: of the lags, of the circulant nearest to them */
+    real *short_at;           /* (I, I) spectra: of the short window */
+    real *SS, *gain;          /* (J, J) spectra of the secondary paths; (J) mean of the diagonal */
+    real *smooth_A, *factor;  /* (J, I, J, I) spectra: of the filtered references, and priced */
+    real *b;                  /* (J, I, L) */
+    real *spectra, *products; /* (J, I), (J, I) spectra */
+    real *vectors;            /* (5, J, I, L) */
+    real *small;              /* (J + 8, J) see `next_prices` */
+    const real *priced;       /* (J) prices of the equations that are solved */
+    real *window;             /* (I, B + N - 1) */
+    real *work;               /* (2, width) */
     int32_t width;
 } budget;
 typedef char budget_fits_into_a_view[sizeof(budget) <= sizeof(anc_view) ? 1 : -1];
-
-enum { REST, SOLUTION, PLAYED, VECTORS_OF_TAPS };
-enum { WORKS = 3 };
 
 /* Layout. */
 
@@ -82,13 +87,12 @@ static int takes(const anc_plan *p, real block, real averaging)
 {
     const double most = 1 << 28, B = block, T = averaging;
     const double K = p->microphones, J = p->loudspeakers, I = p->references;
-    const double L = p->taps, M = p->path_taps, N = L + M - 1, n = I * N + J * M;
+    const double L = p->taps, M = p->path_taps, N = L + M - 1, spectrum = 4 * N + 2;
     if (p->guard_taps || p->scenarios != 1) return 0;
-    if (!(B >= 1 && B <= 65536 && T >= 20 && T <= 100000 && n <= 1 << 14)) return 0;
-    return K * n <= most && J * T <= most && J * J * I * I * 2 * L <= most &&
-           (I + J + K) * (2 * L + M + B) <= most && I * I * L * L <= most &&
-           I * I * 5 * (L + N) <= most && K * J * M <= most && J * J * 2 * M <= most &&
-           I * J * 2 * N <= most;
+    if (!(B >= 1 && B <= 65536 && T >= 20 && T <= 100000 && N <= 1 << 20)) return 0;
+    return (K + DRAWS) * (I + J) * N <= most && J * T <= most &&
+           (I + J + K) * (2 * N + B) <= most && (I + J + 1) * (I + J) * spectrum <= most &&
+           J * I * J * I * spectrum <= most && 5 * J * I * L <= most;
 }
 
 static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
@@ -104,28 +108,36 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
         return;
     }
     layout_posterior(&f->posterior, s, (int32_t)block, !own || own[SPREAD - 1] == 0, at);
-    const int32_t I = s->I, L = s->L, N = f->posterior.N, lags = L + N;
+    const int32_t I = s->I, L = s->L, N = f->posterior.N, B = f->posterior.B;
+    const int32_t spectrum = f->posterior.fourier.spectrum;
     f->T = (int32_t)averaging;
-    f->lags = lags;
-    f->width = 2 * lags + f->posterior.B;
+    f->width = N + B;
     f->asked = reals(at, "asked", ANC_STATE, 1, 1, 3, J);
     f->peak = reals(at, "reference_peak", ANC_STATE, 1, 1, 1, I);
     f->controlled = int32s(at, "controlled", ANC_STATE, 1);
-    f->R = reals(at, "reference_correlation", ANC_STATE, 1, I, I, lags);
-    f->short_R = reals(at, "short_correlation", ANC_STATE, 1, I, I, L);
+    f->R = reals(at, "reference_correlation", ANC_STATE, 1, I, I, N);
+    f->short_R = reals(at, "short_correlation", ANC_STATE, 1, I, I, N);
     f->weight = reals(at, "window_weights", ANC_STATE, 1, 1, 1, 2);
     f->book = reals(at, "book", ANC_STATE, 1, 1, f->T, J);
     f->price = reals(at, "price", ANC_STATE, 1, 1, 1, J);
     f->steady = reals(at, "steady_price", ANC_STATE, 1, 1, 1, J);
-    f->C = reals(at, "two_sided", ANC_SCRATCH, 1, I, I, 2 * lags - 1);
-    f->A = reals(at, "filtered_correlation", ANC_SCRATCH, J * I, J, I, 2 * L - 1);
+    f->now = reals(at, "filters", ANC_STATE, 1, J, I, L);
+    f->at_steady = reals(at, "steady_filters", ANC_STATE, 1, J, I, L);
+    f->lags = reals(at, "lags", ANC_SCRATCH, 1, I, I, N);
+    f->R_at = reals(at, "reference_spectra", ANC_SCRATCH, 1, I, I, spectrum);
+    f->smooth_R = reals(at, "smooth_reference_spectra", ANC_SCRATCH, 1, I, I, spectrum);
+    f->short_at = reals(at, "short_spectra", ANC_SCRATCH, 1, I, I, spectrum);
+    f->SS = reals(at, "path_spectra", ANC_SCRATCH, 1, J, J, spectrum);
+    f->gain = reals(at, "path_gains", ANC_SCRATCH, 1, 1, 1, J);
+    f->smooth_A = reals(at, "smooth_spectra", ANC_SCRATCH, J * I, J, I, spectrum);
+    f->factor = reals(at, "priced_factor", ANC_SCRATCH, J * I, J, I, spectrum);
     f->b = reals(at, "with_disturbance", ANC_SCRATCH, 1, J, I, L);
-    f->sums = reals(at, "priced", ANC_SCRATCH, 1, I, I, 2 * L - 1);
-    f->predictors = reals(at, "predictors", ANC_SCRATCH, I, I, L + 1, (L + 1) / 2);
-    f->forward = reals(at, "forward_predictor", ANC_SCRATCH, 1, I, I, L);
-    f->small = reals(at, "small_matrices", ANC_SCRATCH, 1, L + 6, I, I);
-    f->vectors = reals(at, "vectors", ANC_SCRATCH, 1, VECTORS_OF_TAPS, I, L);
-    f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, WORKS, f->width);
+    f->spectra = reals(at, "filter_spectra", ANC_SCRATCH, 1, J, I, spectrum);
+    f->products = reals(at, "filter_products", ANC_SCRATCH, 1, J, I, spectrum);
+    f->vectors = reals(at, "filter_vectors", ANC_SCRATCH, 5, J, I, L);
+    f->small = reals(at, "dual", ANC_SCRATCH, 1, 1, J + 8, J);
+    f->window = reals(at, "windowed", ANC_SCRATCH, 1, 1, I, B + N - 1);
+    f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, 2, f->width);
 }
 
 /* Return what loudspeaker j has spent in the newest n blocks, in blocks of the rating. */
@@ -155,276 +167,316 @@ static void start_budget(anc_view *view)
 }
 
 static real *work_row(const budget *f, int32_t row) { return f->work + times(row, f->width); }
-static real *taps_of(const budget *f, int32_t number)
-{
-    return f->vectors + times(number, f->s.I * f->s.L);
-}
-
-/* Toeplitz systems. The blocks of a matrix are given by their lags, (I, I, 2L - 1) at some stride:
- * T(l)_ic, l from 1 - L up, is the block m - l = that lag to the right of the diagonal. T(-l) =
- * T(l)'. */
-
-typedef struct {
-    budget *f;
-    const real *A, *R; /* at lag 1 - L of their first elements */
-    size_t next_A, row_A, next_R, row_R;
-    const real *b; /* (I, L) */
-    real scale;
-} toeplitz_system;
-
-/* Set to_i = sum_c T_ic v_c. */
-static void multiply_toeplitz(const budget *f, real *to, const real *T, size_t row, size_t next,
-                              const real *v)
-{
-    const int32_t I = f->s.I, L = f->s.L;
-    real *part = work_row(f, 0);
-    clear(to, times(I, L));
-    for (int32_t i = 0; i < I; i++)
-        for (int32_t c = 0; c < I; c++) {
-            real *restrict sums = to + times(i, L);
-            /* from the last tap to the first */
-            correlate(part, v + times(c, L), L, T + row * (size_t)i + next * (size_t)c, L);
-            for (int32_t l = 0; l < L; l++) sums[l] += part[L - 1 - l];
-        }
-}
-
-/* Factorise the lower triangle of a small matrix, I by I, in place, with the inverse of the
- * diagonal in its place. Return 0 if it is not positive definite. */
-static int factorise_small(real *C, int32_t I)
-{
-    for (int32_t i = 0; i < I; i++)
-        for (int32_t c = 0; c <= i; c++) {
-            real sum = C[i * I + c];
-            for (int32_t k = 0; k < c; k++) sum -= C[i * I + k] * C[c * I + k];
-            if (c == i && !(sum > 0 && isfinite(sum))) return 0;
-            C[i * I + c] = c < i ? sum * C[c * I + c] : 1 / root(sum);
-        }
-    return 1;
-}
-
-/* Solve C z = z; then C' z = z. */
-static void forward_small(const real *C, real *z, int32_t I, int32_t stride)
-{
-    for (int32_t i = 0; i < I; i++) {
-        for (int32_t k = 0; k < i; k++) z[i * stride] -= C[i * I + k] * z[k * stride];
-        z[i * stride] *= C[i * I + i];
-    }
-}
-
-static void backward_small(const real *C, real *z, int32_t I, int32_t stride)
-{
-    for (int32_t i = I - 1; i >= 0; i--) {
-        for (int32_t k = i + 1; k < I; k++) z[i * stride] -= C[k * I + i] * z[k * stride];
-        z[i * stride] *= C[i * I + i];
-    }
-}
-
-/* Solve C C' z = z for a column of a matrix. */
-static void solve_small(const real *C, real *z, int32_t I)
-{
-    forward_small(C, z, I, I);
-    backward_small(C, z, I, I);
-}
-
-/* The backward predictor B of order m, (I, I, m + 1). */
-static real *predictor_of(const budget *f, int32_t m)
-{
-    return f->predictors + times(f->s.I, f->s.I) * (times(m, m + 1) / 2);
-}
-
-static real *factor_of(const budget *f, int32_t m) { return f->small + times(m, f->s.I * f->s.I); }
-
-/* Set the sums to T = A + price R, and start Whittle's recursion with order 0. */
-static void start_recursion(const toeplitz_system *t, real price, real *D, real *E)
-{
-    const budget *f = t->f;
-    const int32_t I = f->s.I, L = f->s.L, lags = 2 * L - 1;
-    for (int32_t i = 0; i < I; i++)
-        for (int32_t c = 0; c < I; c++) {
-            const real *A = t->A + t->row_A * (size_t)i + t->next_A * (size_t)c;
-            const real *R = t->R + t->row_R * (size_t)i + t->next_R * (size_t)c;
-            real *restrict T = f->sums + times(i * I + c, lags);
-            for (int32_t l = 0; l < lags; l++) T[l] = A[l] + price * R[l];
-            if (i == c) T[L - 1] = A[L - 1] * (1 + REGULAR) + price * R[L - 1];
-            /* A reference that is silent, or that nobody hears: its filter is zero. */
-            if (i == c && T[L - 1] == 0) T[L - 1] = 1;
-            D[i * I + c] = E[i * I + c] = T[L - 1];
-            f->forward[times(i * I + c, L)] = i == c;
-            predictor_of(f, 0)[i * I + c] = i == c;
-        }
-}
-
-/* Factorise T = A + price R by Whittle's recursion; return 0 if it is not positive definite.
- *
- * For the first m + 1 blocks T_m of T: T_m B_m = [0, ..., 0, E], T_m F = [D, 0, ..., 0], where the
- * last block of B_m and the first of F are 1. So T^-1 = sum_m B_m E_m^-1 B_m'. With Delta = sum_k
- * T(k - m - 1) F_k: F  = [F, 0] - [0, B] E^-1 Delta      D = D - Delta' E^-1 Delta B  = [0, B] -
- * [F, 0] D^-1 Delta'     E = E - Delta D^-1 Delta' */
-static int factorise(const toeplitz_system *t, real price)
-{
-    const budget *f = t->f;
-    const int32_t I = f->s.I, L = f->s.L, lags = 2 * L - 1, square = I * I;
-    real *D = factor_of(f, L), *E = D + square, *Delta = E + square;
-    real *P = Delta + square, *Q = P + square; /* E^-1 Delta, D^-1 Delta' */
-    real *F = f->forward, *B = predictor_of(f, 0);
-    start_recursion(t, price, D, E);
-    for (int32_t m = 0;; m++) {
-        real *C = factor_of(f, m), *next = predictor_of(f, m + 1);
-        copy(C, E, (size_t)square);
-        if (!factorise_small(C, I)) return 0;
-        if (m == L - 1) return 1;
-        for (int32_t i = 0; i < I; i++)
-            for (int32_t c = 0; c < I; c++) {
-                real sum = 0;
-                for (int32_t k = 0; k < I; k++) {
-                    const real *T = f->sums + times(i * I + k, lags) + (L - 2 - m);
-                    sum += dot(T, F + times(k * I + c, L), m + 1);
-                }
-                Delta[i * I + c] = P[i * I + c] = Q[c * I + i] = sum;
-            }
-        for (int32_t c = 0; c < I; c++) solve_small(C, P + c, I);
-        real *of_D = factor_of(f, L + 5);
-        copy(of_D, D, (size_t)square);
-        if (!factorise_small(of_D, I)) return 0;
-        for (int32_t c = 0; c < I; c++) solve_small(of_D, Q + c, I);
-        for (int32_t i = 0; i < I; i++)
-            for (int32_t c = 0; c < I; c++) {
-                real *restrict to = next + times(i * I + c, m + 2);
-                to[0] = 0;
-                copy(to + 1, B + times(i * I + c, m + 1), (size_t)(m + 1));
-                for (int32_t k = 0; k < I; k++) {
-                    add_scaled(to, -Q[k * I + c], F + times(i * I + k, L), m + 1);
-                    E[i * I + c] -= Delta[i * I + k] * Q[k * I + c];
-                    D[i * I + c] -= Delta[k * I + i] * P[k * I + c];
-                }
-            }
-        for (int32_t i = 0; i < I; i++)
-            for (int32_t c = 0; c < I; c++) {
-                real *to = F + times(i * I + c, L);
-                to[m + 1] = 0;
-                for (int32_t k = 0; k < I; k++)
-                    add_scaled(to + 1, -P[k * I + c], B + times(i * I + k, m + 1), m + 1);
-            }
-        B = next;
-    }
-}
-
-/* Set v to T^-1 u; return u'T^-1 u. */
-static real solve_factorised(const budget *f, const real *u, real *v)
-{
-    const int32_t I = f->s.I, L = f->s.L;
-    real *z = factor_of(f, L), energy = 0;
-    if (v) clear(v, times(I, L));
-    for (int32_t m = 0; m < L; m++) {
-        const real *B = predictor_of(f, m), *C = factor_of(f, m);
-        for (int32_t c = 0; c < I; c++) {
-            z[c] = 0;
-            for (int32_t i = 0; i < I; i++)
-                z[c] += dot(B + times(i * I + c, m + 1), u + times(i, L), m + 1);
-        }
-        forward_small(C, z, I, 1);
-        for (int32_t c = 0; c < I; c++) energy += z[c] * z[c];
-        if (!v) continue;
-        backward_small(C, z, I, 1);
-        for (int32_t i = 0; i < I; i++)
-            for (int32_t c = 0; c < I; c++)
-                add_scaled(v + times(i, L), z[c], B + times(i * I + c, m + 1), m + 1);
-    }
-    return energy;
-}
-
-/* Set v to the filter at a price, u to R v, and return its power; 0 and no filter if there is no
- * solution. */
-static real power_at(const toeplitz_system *t, real price, real *v, real *u, int *solved)
-{
-    const budget *f = t->f;
-    const int32_t n = f->s.I * f->s.L;
-    *solved = factorise(t, price);
-    if (*solved) {
-        solve_factorised(f, t->b, v);
-        for (int32_t i = 0; i < n; i++) *solved = *solved && within(v[i], LARGEST_TAP);
-    }
-    if (!*solved) {
-        clear(v, (size_t)n);
-        return 0;
-    }
-    multiply_toeplitz(f, u, t->R, t->row_R, t->next_R, v);
-    return dot(v, u, n);
-}
-
-/* Return the least price >= 0 at which the filter takes at most `power`; set v to it. power^-1/2 is
- * a concave function of the price, nearly a line, so Newton's steps approach from below. */
-static real price_of(const toeplitz_system *t, real power, real start, real *v)
-{
-    real price = start < (real)1e6 * t->scale ? start : 0;
-    real *u = taps_of(t->f, PLAYED);
-    int solved = 0;
-    for (int n = 0; n < NEWTON; n++) {
-        const real taken = power_at(t, price, v, u, &solved);
-        if (!solved) {
-            const real least = (real)1e-6 * t->scale;
-            price = 2 * price < least ? least : 2 * price;
-            continue;
-        }
-        const real away = taken - power;
-        if (within(away, NEAR * power) || (price == 0 && taken <= power)) break;
-        const real slope = solve_factorised(t->f, u, NULL);
-        if (!(slope > 0)) break;
-        /* power^-1/2 has the slope taken^-3/2 u' T^-1 u */
-        price = larger(price + taken * (root(taken / power) - 1) / slope, 0);
-    }
-    return price;
-}
+static int32_t all_taps(const budget *f) { return f->s.J * f->s.I * f->s.L; }
 
 /* The references. */
 
-/* The factor of the short window, a sample. */
+/* Return the factor of the short window, a sample. */
 static real short_window(const budget *f) { return raised(*f->s.setting[WINDOW], SHORTER); }
 
-/* Add the block to a window of the references, (I, I, lags), and to its weight; x is zero before
- * the first, so the sums are positive definite. */
-static void take_references(const budget *f, real *sums, int32_t lags, real g, real *weight)
+/* Add the block to a window of the references, (I, I, N), and to its weight. Set the lags to those
+ * of a window into which the newest block fades in: without its edge, on which a filter would ring.
+ * Both are lags of one faded signal, hence positive definite. */
+static void take_references(budget *f, real *sums, real *weight, real g)
 {
-    const int32_t I = f->s.I, B = f->posterior.B;
-    const real fade = raised(g, B);
-    real *windowed = work_row(f, 0), *more = work_row(f, 1);
+    const int32_t I = f->s.I, N = f->posterior.N, B = f->posterior.B;
+    const fourier *F = &f->posterior.fourier;
+    const size_t length = (size_t)(B + N - 1);
+    const real fade = raised(g, B), slow = root(g);
+    real all = 0, soft = 0, share = 1, loud = 0, usual = 0;
+    for (int32_t t = 0; t < (int32_t)length; t++, share *= slow) {
+        const real from_begin = ((real)(B - t) - (real)0.5) / (real)B;
+        const real fade_in = t < B ? 1 - from_begin * from_begin : 1;
+        for (int32_t i = 0; i < I; i++)
+            f->window[(size_t)i * length + (size_t)t] =
+                share * fade_in * history_of(&f->posterior, i)[t];
+        if (t >= B) continue;
+        all += share * share;
+        soft += share * share * fade_in * fade_in;
+    }
     for (int32_t i = 0; i < I; i++) {
-        const real *u = history_of(&f->posterior, i);
-        real share = 1, all = 0;
-        for (int32_t t = 0; t < B; t++) {
-            windowed[t] = share * u[t];
-            all += share;
-            share *= g;
-        }
+        const real *x = history_of(&f->posterior, i);
+        loud += dot(x, x, B) / (real)B;
+        usual += sums[times(i * I + i, N)];
+    }
+    /* After a soft time, the mean is that of the loud block at once: the soft samples count less.
+     */
+    if (loud * *weight > LOUDER * usual) *weight = usual / loud;
+    for (size_t n = 0; n < times(I * I, N); n++) f->lags[n] = sums[n] = faded(sums[n], fade, 0);
+    for (int32_t i = 0; i < I; i++)
+        for (int32_t a = 0; a < I; a++)
+            add_lags(F, f->lags + times(i * I + a, N), f->window + (size_t)i * length, B,
+                     f->window + (size_t)a * length, N);
+    for (size_t n = 0; n < times(I * I, N); n++) f->lags[n] /= fade * *weight + soft;
+    share = 1;
+    for (int32_t t = 0; t < (int32_t)length; t++, share *= slow)
+        for (int32_t i = 0; i < I; i++)
+            f->window[(size_t)i * length + (size_t)t] = share * history_of(&f->posterior, i)[t];
+    for (int32_t i = 0; i < I; i++)
+        for (int32_t a = 0; a < I; a++)
+            add_lags(F, sums + times(i * I + a, N), f->window + (size_t)i * length, B,
+                     f->window + (size_t)a * length, N);
+    *weight = fade * *weight + all;
+}
+
+/* Set the spectra of the lags; their mean square becomes `more` times as large, as if there were
+ * white noise. */
+static void transform_references(budget *f, real *spectra, real more, int32_t n, int smooth)
+{
+    const int32_t I = f->s.I, N = f->posterior.N;
+    const fourier *F = &f->posterior.fourier;
+    for (int32_t i = 0; i < I; i++)
         for (int32_t a = 0; a < I; a++) {
-            real *restrict R = sums + times(i * I + a, lags);
-            correlate(more, windowed, B, history_of(&f->posterior, a), lags);
-            for (int32_t l = 0; l < lags; l++) R[l] = faded(R[l], fade, more[l]);
+            const real *ahead = f->lags + times(a * I + i, N),
+                       *behind = f->lags + times(i * I + a, N);
+            real *spectrum = spectra + times(i * I + a, F->spectrum);
+            transform_lags(F, spectrum, ahead, behind, n, smooth);
+            for (int32_t k = 0; i == a && k < F->bins; k++) spectrum[k] += more * ahead[0];
         }
-        if (i == 0) *weight = fade * *weight + all;
+}
+
+/* The equations. */
+
+/* Set the spectra of the paths over the posterior: of secondary ones with each other, and of
+ * primary ones with these, (J, I), in the products. */
+static void correlate_paths(budget *f)
+{
+    const int32_t I = f->s.I, J = f->s.J, M = f->s.M, N = f->posterior.N;
+    const fourier *F = &f->posterior.fourier;
+    const size_t each = (size_t)F->spectrum;
+    real *path = work_row(f, 0), *P = F->work + 4 * (F->F + 2);
+    clear(f->SS, times(J * J, F->spectrum));
+    clear(f->products, times(J * I, F->spectrum));
+    for (int32_t row = 0; row < f->posterior.rows; row++) {
+        for (int32_t j = 0; j < J; j++) {
+            secondary_of(&f->posterior, row, j, path);
+            transform(F, f->spectra + (size_t)j * each, path, M);
+        }
+        for (int32_t j = 0; j < J; j++)
+            for (int32_t a = 0; a < J; a++)
+                add_product(F, f->SS + times(j * J + a, F->spectrum), f->spectra + (size_t)j * each,
+                            f->spectra + (size_t)a * each, 1, -1);
+        for (int32_t c = 0; c < I; c++) {
+            primary_of(&f->posterior, row, c, path);
+            transform(F, P, path, N);
+            for (int32_t j = 0; j < J; j++)
+                add_product(F, f->products + times(j * I + c, F->spectrum),
+                            f->spectra + (size_t)j * each, P, 1, -1);
+        }
     }
 }
 
-/* Set C to the correlations of the references at both signs of l, tapered. */
-static void correlate_references(budget *f)
+/* Set A = SS R, the circulant nearest to it, and b. */
+static void set_equations(budget *f)
 {
-    const int32_t I = f->s.I, lags = f->lags;
-    const real g = root(*f->s.setting[WINDOW]), weight = *f->weight;
-    for (int32_t i = 0; i < I; i++)
-        for (int32_t a = 0; a < I; a++) {
-            const real *R = f->R + times(i * I + a, lags), *other = f->R + times(a * I + i, lags);
-            real *C = f->C + times(i * I + a, 2 * lags - 1) + (lags - 1), taper = 1;
-            for (int32_t l = 0; l < lags; l++) {
-                C[l] = R[l] / weight * taper;
-                C[-l] = other[l] / weight * taper;
-                taper *= g;
+    const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
+    const fourier *F = &f->posterior.fourier;
+    const size_t each = (size_t)F->spectrum;
+    real *sums = f->spectra, *lags = F->work + 3 * (F->F + 2), *behind = F->work + 4 * (F->F + 2);
+    correlate_paths(f);
+    for (int32_t j = 0; j < J; j++)
+        for (int32_t i = 0; i < I; i++) {
+            clear(sums, each);
+            for (int32_t c = 0; c < I; c++)
+                add_product(F, sums, f->products + times(j * I + c, F->spectrum),
+                            f->R_at + times(i * I + c, F->spectrum), 1, 1);
+            transform_back(F, lags, sums);
+            copy(f->b + times(j * I + i, L), lags, (size_t)L);
+        }
+    for (int32_t j = 0; j < J; j++) {
+        transform_back(F, lags, f->SS + times(j * J + j, F->spectrum));
+        f->gain[j] = lags[0];
+    }
+    for (int32_t ji = 0; ji < J * I; ji++)
+        for (int32_t ac = 0; ac <= ji; ac++) {
+            const int32_t j = ji / I, i = ji % I, a = ac / I, c = ac % I;
+            clear(sums, each);
+            add_product(F, sums, f->SS + times(j * J + a, F->spectrum),
+                        f->R_at + times(i * I + c, F->spectrum), 1, 1);
+            transform_back(F, lags, sums);
+            for (int32_t l = 1; l < L; l++) behind[l] = lags[F->F - l];
+            transform_lags(F, f->smooth_A + times(ji * J * I + ac, F->spectrum), lags, behind, L,
+                           1);
+        }
+}
+
+/* Set to_i = sum_c R_ic v_c for a filter v, (I, L), of one loudspeaker. */
+static void multiply_references(budget *f, const real *R, real *to, const real *v)
+{
+    const int32_t I = f->s.I, L = f->s.L;
+    const fourier *F = &f->posterior.fourier;
+    const size_t each = (size_t)F->spectrum;
+    real *sums = F->work + 2 * (F->F + 2);
+    for (int32_t c = 0; c < I; c++) transform(F, f->spectra + (size_t)c * each, v + times(c, L), L);
+    for (int32_t i = 0; i < I; i++) {
+        clear(sums, each);
+        for (int32_t c = 0; c < I; c++)
+            add_product(F, sums, R + times(i * I + c, F->spectrum), f->spectra + (size_t)c * each,
+                        1, 1);
+        transform_back(F, F->work + 3 * (F->F + 2), sums);
+        copy(to + times(i, L), F->work + 3 * (F->F + 2), (size_t)L);
+    }
+}
+
+/* Return the power of loudspeaker j with the filters v; R v is left in `to`, (I, L). */
+static real power_of(budget *f, const real *R, const real *v, int32_t j, real *to)
+{
+    const int32_t n = f->s.I * f->s.L;
+    multiply_references(f, R, to, v + times(j, n));
+    return dot(to, v + times(j, n), n);
+}
+
+/* Set to = (A + price R) v for all filters. */
+static void multiply_filters(void *self, real *to, const real *v)
+{
+    budget *f = self;
+    const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
+    const fourier *F = &f->posterior.fourier;
+    const size_t each = (size_t)F->spectrum;
+    real *sums = F->work + 2 * (F->F + 2);
+    for (int32_t ac = 0; ac < J * I; ac++)
+        transform(F, f->spectra + (size_t)ac * each, v + times(ac, L), L);
+    clear(f->products, (size_t)(J * I) * each);
+    for (int32_t a = 0; a < J; a++)
+        for (int32_t i = 0; i < I; i++)
+            for (int32_t c = 0; c < I; c++)
+                add_product(F, f->products + times(a * I + i, F->spectrum),
+                            f->R_at + times(i * I + c, F->spectrum),
+                            f->spectra + times(a * I + c, F->spectrum), 1, 1);
+    for (int32_t j = 0; j < J; j++)
+        for (int32_t i = 0; i < I; i++) {
+            const real *own = f->products + times(j * I + i, F->spectrum);
+            const real price = f->priced[j] + REGULAR * f->gain[j];
+            for (size_t k = 0; k < each; k++) sums[k] = price * own[k];
+            for (int32_t a = 0; a < J; a++)
+                add_product(F, sums, f->SS + times(j * J + a, F->spectrum),
+                            f->products + times(a * I + i, F->spectrum), 1, 1);
+            transform_back(F, F->work + 3 * (F->F + 2), sums);
+            copy(to + times(j * I + i, L), F->work + 3 * (F->F + 2), (size_t)L);
+        }
+}
+
+static void precondition_filters(void *self, real *to, const real *r)
+{
+    budget *f = self;
+    const int32_t n = f->s.J * f->s.I, L = f->s.L;
+    const fourier *F = &f->posterior.fourier;
+    const size_t each = (size_t)F->spectrum;
+    for (int32_t ac = 0; ac < n; ac++)
+        transform(F, f->spectra + (size_t)ac * each, r + times(ac, L), L);
+    solve_spectra(F, f->factor, f->spectra, n);
+    for (int32_t ac = 0; ac < n; ac++) {
+        transform_back(F, F->work + 2 * (F->F + 2), f->spectra + (size_t)ac * each);
+        copy(to + times(ac, L), F->work + 2 * (F->F + 2), (size_t)L);
+    }
+}
+
+/* Go some steps from the filters v towards those at the prices. */
+static void solve_at(budget *f, const real *prices, real *v)
+{
+    const int32_t I = f->s.I, J = f->s.J, n = all_taps(f);
+    const fourier *F = &f->posterior.fourier;
+    const equations own = {f, multiply_filters, precondition_filters, n, f->vectors};
+    f->priced = prices;
+    copy(f->factor, f->smooth_A, times(J * I * J * I, F->spectrum));
+    for (int32_t j = 0; j < J; j++)
+        for (int32_t i = 0; i < I; i++)
+            for (int32_t c = 0; c <= i; c++)
+                add_scaled(f->factor + times((j * I + i) * J * I + j * I + c, F->spectrum),
+                           prices[j] + REGULAR * f->gain[j],
+                           f->smooth_R + times(i * I + c, F->spectrum), F->spectrum);
+    factorise_spectra(F, f->factor, J * I);
+    approach(&own, f->b, v, FILTER_STEPS, 0);
+    for (int32_t i = 0; i < n; i++)
+        if (!within(v[i], LARGEST_TAP)) {
+            clear(v, (size_t)n);
+            return;
+        }
+}
+
+/* The prices. */
+
+/* Solve H x = x, of J equations; H, symmetric and definite, becomes its factor. */
+static void solve_small(real *H, real *x, int32_t J)
+{
+    for (int32_t i = 0; i < J; i++) {
+        for (int32_t c = 0; c <= i; c++) {
+            real sum = H[i * J + c];
+            for (int32_t k = 0; k < c; k++) sum -= H[i * J + k] * H[c * J + k];
+            H[i * J + c] = c < i ? sum * H[c * J + c] : 1 / root(larger(sum, LEAST_POWER));
+        }
+        for (int32_t k = 0; k < i; k++) x[i] -= H[i * J + k] * x[k];
+        x[i] *= H[i * J + i];
+    }
+    for (int32_t i = J - 1; i >= 0; i--) {
+        for (int32_t k = i + 1; k < J; k++) x[i] -= H[k * J + i] * x[k];
+        x[i] *= H[i * J + i];
+    }
+}
+
+/* Set H_ja = u_j'A^-1 u_a, u_j = R v_j, with the preconditioner in place of A, and the powers. */
+static void set_slopes(budget *f, const real *v, real *H, real *power)
+{
+    const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
+    const fourier *F = &f->posterior.fourier;
+    const size_t each = (size_t)F->spectrum;
+    real *u = f->vectors;
+    for (int32_t j = 0; j < J; j++) power[j] = power_of(f, f->R_at, v, j, u + times(j, I * L));
+    for (int32_t ji = 0; ji < J * I; ji++)
+        transform(F, f->products + (size_t)ji * each, u + times(ji, L), L);
+    for (int32_t a = 0; a < J; a++) {
+        clear(f->spectra, times(J * I, F->spectrum));
+        copy(f->spectra + times(a * I, F->spectrum), f->products + times(a * I, F->spectrum),
+             times(I, F->spectrum));
+        solve_spectra(F, f->factor, f->spectra, J * I);
+        for (int32_t j = 0; j < J; j++) {
+            H[j * J + a] = 0;
+            for (int32_t i = 0; i < I; i++) {
+                const real *x = f->products + times(j * I + i, F->spectrum);
+                const real *y = f->spectra + times(j * I + i, F->spectrum);
+                const real ends = x[0] * y[0] + x[F->half] * y[F->half]; /* the others come twice */
+                H[j * J + a] += (2 * dot(x, y, (int32_t)each) - ends) / (real)F->F;
             }
         }
+    }
+}
+
+/* Make a step of Newton's method with the prices, of which power^-1/2 is nearly a line, with the
+ * slope power^-3/2 u'A^-1 u. */
+static void next_prices(budget *f, real *price, const real *v, const real *target)
+{
+    const int32_t J = f->s.J;
+    real *H = f->small, *power = H + times(J, J), *size = power + J, *step = size + J;
+    real *factor = f->factor, gain = 0;
+    set_slopes(f, v, H, power);
+    for (int32_t j = 0; j < J; j++) {
+        const int free = price[j] > 0 || power[j] > target[j];
+        size[j] = free ? 1 / root(larger(H[j * J + j], LEAST_POWER)) : 0;
+    }
+    for (int32_t j = 0; j < J; j++)
+        for (int32_t a = 0; a < J; a++) H[j * J + a] *= size[j] * size[a];
+    for (int32_t j = 0; j < J; j++) H[j * J + j] += size[j] > 0 ? REGULAR : 1;
+    for (int straight = 0; straight < 2 && !(gain > 0); straight++) {
+        copy(factor, H, times(J, J));
+        for (int32_t j = 0; j < J; j++)
+            step[j] = size[j] * (straight ? (power[j] - target[j]) / 2
+                                          : power[j] * (root(power[j] / target[j]) - 1));
+        solve_small(factor, step, J);
+        for (int32_t j = 0; j < J; j++) {
+            step[j] *= size[j];
+            gain += step[j] * (power[j] - target[j]);
+        }
+    }
+    for (int32_t j = 0; j < J; j++) {
+        const real most = larger(PRICE_RISES * price[j], (real)1e-3 * f->gain[j]);
+        price[j] += smaller(larger(step[j], -price[j]), most);
+        if (price[j] < (real)1e-9 * f->gain[j]) price[j] = 0;
+    }
 }
 
 /* The account. */
 
-/* Return the mean power of the filter v in the present block. */
+/* Return the mean power of the filter v, (I, L), in the present block. */
 static real power_of_block(const budget *f, const real *v)
 {
     const int32_t L = f->s.L, B = f->posterior.B;
@@ -437,161 +489,82 @@ static real power_of_block(const budget *f, const real *v)
     return dot(y, y, B) / (real)B;
 }
 
-/* Return the mean power of the filter v over the short window:
- * E[y^2] = sum_l (v_i ~ v_a)(l) C_ia(l), with both signs of l in the two orders of i and a. */
-static real power_of_now(const budget *f, const real *v)
-{
-    const int32_t I = f->s.I, L = f->s.L;
-    const real g = root(short_window(f));
-    real *part = work_row(f, 1), *wide = work_row(f, 2), power = 0;
-    for (int32_t a = 0; a < I; a++) {
-        copy(wide, v + times(a, L), (size_t)L);
-        clear(wide + L, (size_t)L);
-        for (int32_t i = 0; i < I; i++) {
-            const real *R = f->short_R + times(i * I + a, L);
-            real taper = 1, sum = 0;
-            correlate(part, v + times(i, L), L, wide, L); /* sum_m v_a(m + l) v_i(m) */
-            for (int32_t l = 0; l < L; l++) {
-                sum += (real)(l ? 2 : 1) * taper * R[l] * part[l];
-                taper *= g;
-            }
-            power += sum;
-        }
-    }
-    return power / f->weight[1];
-}
-
 /* Return the largest factor on the power of filter v that loudspeaker j's account can afford, if
- * the noise goes on: that of the last block for a short time, and that of the window of x, for
- * which v takes `power`, for longer. If a silence has `saved` power, the present level must be
- * affordable for even longer: otherwise the saved power would be spent at once, and be missing
- * later. */
-static real affordable(const budget *f, int32_t j, const real *v, real power, real level, int saved)
+ * its noise goes on for a time: that of the last block; for longer, that of the window of x, for
+ * which v takes `power`; and `later` times that for any longer time, if this is not 0. */
+static real affordable(const budget *f, int32_t j, const real *v, real power, real later)
 {
     const int32_t T = f->T, block = T / BLOCK_LASTS, window = T / WINDOW_LASTS;
     const real rated = f->s.setting[RATED_POWER][j], of_block = power_of_block(f, v);
-    const real of_now = power * (level < 1 ? level : 1);
     real spent = 0, factor = 0;
-    for (int32_t n = T - 1; n >= block; n--) { /* spent, and still counted n blocks from now */
+    for (int32_t n = T - 1; n >= block; n--) { /* spent: and in the account after n blocks, too */
         spent += f->book[times(T - 1 - n, f->s.J) + (size_t)j];
-        const int longer = saved && n > window && n <= T - window;
+        const int longer = later > 0 && n > window && n <= T - block;
         if (!longer && n != window && n != block) continue;
-        const real left = larger((real)T - spent, LEAST_SHARE * (real)n);
-        const real expected = longer ? of_now : n == window ? power : of_block;
+        const real left = larger(PLANNED * (real)T - spent, LEAST_SHARE * (real)n);
+        const real expected = longer ? later * power : n == window ? power : of_block;
         const real afforded = left / (real)n * rated / larger(expected, LEAST_POWER);
         if (factor == 0 || afforded < factor) factor = afforded;
     }
     return factor;
 }
 
-/* Set the price of loudspeaker j, and its filter at that price, given what the others leave. */
-static void spend(budget *f, int32_t j, const real *rest, real left)
+/* Set the shares of their powers that the filters may have, and these powers. Return whether the
+ * account of a loudspeaker refuses some. */
+static int set_shares(budget *f, const real *later, real *share, real *power)
 {
-    const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
-    const size_t row = (size_t)(2 * L - 1), row_C = (size_t)(2 * f->lags - 1);
-    const real rated = f->s.setting[RATED_POWER][j];
-    real *v = taps_of(f, SOLUTION), q = 0;
-    toeplitz_system t = {
-        .f = f,
-        .A = f->A + times(j * I * J + j, I) * row,
-        .row_A = times(J, I) * row,
-        .next_A = row,
-        .R = f->C + (f->lags - L),
-        .row_R = times(I, 1) * row_C,
-        .next_R = row_C,
-        .b = rest,
-    };
-    int solved;
-    for (int32_t i = 0; i < I && !(t.scale > 0); i++) { /* of the first reference that is heard */
-        const real *A = t.A + (t.row_A + t.next_A) * (size_t)i;
-        const real *R = t.R + (t.row_R + t.next_R) * (size_t)i;
-        t.scale = A[L - 1] / larger(R[L - 1], LEAST_POWER);
+    int refused = 0;
+    for (int32_t j = 0; j < f->s.J; j++) {
+        const real *v = f->now + times(j, f->s.I * f->s.L);
+        power[j] = power_of(f, f->R_at, f->now, j, f->vectors);
+        share[j] = smaller(affordable(f, j, v, power[j], later[j]), 1);
+        power[j] *= share[j];
+        refused |= share[j] < 1;
     }
-    /* 1 The price at which the filter spends the rating, for the spectrum of the window of x and
-     * the level of the shorter one, which the last filter tells. */
-    const real *last = weights_of(&f->s, j);
-    multiply_toeplitz(f, taps_of(f, PLAYED), t.R, t.row_R, t.next_R, last);
-    const real usual = dot(last, taps_of(f, PLAYED), I * L), now = power_of_now(f, last);
-    const real level = usual > 0 && now > 0 ? now / usual : 1;
-    f->steady[j] = price_of(&t, rated / level, f->steady[j], v);
-    /* 2 What the account holds makes power cheaper, but none that saves little of the noise. */
-    for (int32_t k = 0; k < f->s.K; k++) q += f->posterior.q[k];
-    const real cheaper = larger(1 - CHEAPER * larger(left, 0), CHEAPEST);
-    real price = larger(f->steady[j] * cheaper, WORTHWHILE * q / (rated * (real)J));
-    const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
-    /* 3 The account must afford it, for longer if more is left than the price follows. */
-    const int saved = CHEAPER * left > 1 - CHEAPEST;
-    const real factor = power > 0 ? affordable(f, j, v, power, level, saved) : 1;
-    if (factor < 1) price = price_of(&t, factor * power, price, v);
-    f->price[j] = price;
-    copy(weights_of(&f->s, j), v, times(I, L));
+    return refused;
 }
 
-/* Set the correlations of x'_ji with x'_ac, and those of x'_ac with x'_ji:
- * E[x'_ji(t) x'_ac(t - l)] = sum_u (s_j ~ s_a)(u) C_ic(l - u), where
- * (s_a ~ s_j)(u) = (s_j ~ s_a)(-u). */
-static void correlate_pair(budget *f, int32_t j, int32_t i, int32_t a, int32_t c)
-{
-    const posterior *p = &f->posterior;
-    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, M = f->s.M, lags = 2 * L - 1;
-    const int32_t from = a == j && c == i ? L - 1 : 0; /* of one signal they are symmetric */
-    const real *ss = p->ss + times(a * J + j, 2 * M - 1);
-    const real *C = f->C + times(i * I + c, 2 * f->lags - 1) + (f->lags - L - M + 1 + from);
-    real *A = f->A + times((j * I + i) * J * I + a * I + c, lags);
-    real *other = f->A + times((a * I + c) * J * I + j * I + i, lags);
-    correlate(A + from, ss, 2 * M - 1, C, lags - from);
-    for (int32_t l = from ? L : 0; l < lags; l++) other[lags - 1 - l] = A[l];
-}
-
-/* Set the correlations of d with x'_ji:
- * E[d(t) x'_ji(t - l)] = sum_u (p_c ~ s_j)(u) C_ci(l - u), summed over c. */
-static void correlate_disturbance(budget *f, int32_t j, int32_t i)
-{
-    const posterior *p = &f->posterior;
-    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, M = f->s.M, N = p->N;
-    real *b = f->b + times(j * I + i, L), *part = work_row(f, 0);
-    clear(b, (size_t)L);
-    for (int32_t c = 0; c < I; c++) {
-        const real *ps = p->ps + times(c * J + j, N + M - 1);
-        const real *C = f->C + times(c * I + i, 2 * f->lags - 1) + (f->lags - N);
-        correlate(part, ps, N + M - 1, C, L);
-        add_to(b, part, L);
-    }
-}
-
-/* Set the correlations of all filtered references, and with the disturbance. */
-static void correlate_filtered(budget *f)
-{
-    const int32_t I = f->s.I, J = f->s.J;
-    for (int32_t j = 0; j < J; j++)
-        for (int32_t i = 0; i < I; i++) {
-            for (int32_t a = 0; a <= j; a++)
-                for (int32_t c = 0; c < (a < j ? I : i + 1); c++) correlate_pair(f, j, i, a, c);
-            correlate_disturbance(f, j, i);
-        }
-}
-
-/* Give each loudspeaker in turn the filter of least expected error at its price, given the others'.
- */
+/* Set the prices, and the filters of least expected error at these prices. */
 static void solve_all(budget *f)
 {
-    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, n = I * L;
-    const size_t row = (size_t)(2 * L - 1), row_A = times(J, I) * row;
-    real *rest = taps_of(f, REST), *part = taps_of(f, PLAYED);
-    if (f->posterior.counts[STALE]) expect(&f->posterior);
-    correlate_references(f);
-    correlate_filtered(f);
+    const int32_t J = f->s.J, n = f->s.I * f->s.L;
+    real *later = f->small + times(J + 4, J), *target = later + J, *share = target + J, q = 0;
+    set_equations(f);
+    /* 1 The prices at which the filters spend the rating, for the spectrum of the window of x and
+     * the level of the shorter one, which the last filters tell. */
     for (int32_t j = 0; j < J; j++) {
-        const real left = 1 - spent_by(f, j, f->T) / (real)f->T;
-        copy(rest, f->b + times(j, n), (size_t)n);
-        for (int32_t a = 0; a < J; a++) {
-            if (a == j) continue;
-            const real *A = f->A + times(j * I * J + a, I) * row;
-            multiply_toeplitz(f, part, A, row_A, row, weights_of(&f->s, a));
-            add_scaled(rest, -1, part, n);
-        }
-        spend(f, j, rest, left);
+        const real *last = f->s.weights;
+        const real usual = power_of(f, f->R_at, last, j, f->vectors);
+        const real now = power_of(f, f->short_at, last, j, f->vectors);
+        const real level = usual > 0 && now > 0 ? now / usual : 1;
+        target[j] = f->s.setting[RATED_POWER][j] / level;
+        later[j] = smaller(level, 1);
     }
+    for (int step = 0; step < PRICE_STEPS; step++) {
+        solve_at(f, f->steady, f->at_steady);
+        next_prices(f, f->steady, f->at_steady, target);
+    }
+    /* 2 What the account holds makes power cheaper, but none that saves little of the noise. */
+    for (int32_t k = 0; k < f->s.K; k++) q += f->posterior.q[k];
+    for (int32_t j = 0; j < J; j++) {
+        const real left = larger(1 - spent_by(f, j, f->T) / (real)f->T, 0);
+        const real cheaper = larger(1 - CHEAPER * left, CHEAPEST);
+        /* A silence has left more than the price follows: else it would be spent at once, and be
+         * missing later. */
+        if (CHEAPER * left <= 1 - CHEAPEST) later[j] = 0;
+        const real least = WORTHWHILE * q / (f->s.setting[RATED_POWER][j] * (real)J);
+        f->price[j] = larger(f->steady[j] * cheaper, least);
+    }
+    solve_at(f, f->price, f->now);
+    /* 3 The account must afford it: by the price, and what is left is taken off. */
+    if (set_shares(f, later, share, target)) {
+        next_prices(f, f->price, f->now, target);
+        solve_at(f, f->price, f->now);
+        set_shares(f, later, share, target);
+    }
+    for (int32_t j = 0; j < J; j++)
+        for (int32_t i = 0; i < n; i++)
+            weights_of(&f->s, j)[i] = root(share[j]) * f->now[times(j, n) + (size_t)i];
 }
 
 /* A sample. */
@@ -599,8 +572,11 @@ static void solve_all(budget *f)
 static void end_block(budget *f)
 {
     const int32_t J = f->s.J, B = f->posterior.B;
-    take_references(f, f->R, f->lags, *f->s.setting[WINDOW], f->weight);
-    take_references(f, f->short_R, f->s.L, short_window(f), f->weight + 1);
+    take_references(f, f->short_R, f->weight + 1, short_window(f));
+    transform_references(f, f->short_at, 0, f->posterior.N, 0);
+    take_references(f, f->R, f->weight, *f->s.setting[WINDOW]);
+    transform_references(f, f->R_at, REGULAR, f->posterior.N, 0);
+    transform_references(f, f->smooth_R, REGULAR, f->s.L, 1);
     if (*f->controlled) {
         memmove(f->book + J, f->book, sizeof(real) * times(f->T - 1, J));
         for (int32_t j = 0; j < J; j++)

@@ -1,8 +1,9 @@
 #include "posterior.h"
 
 /* A surprise is an error beyond this many times the noise and the doubt: the error of a steady
- * recording reaches four times its mean, and to forget costs about as much. */
-static const real SURPRISE = 6;
+ * recording reaches between seven and eight times its mean where the path is longer than the
+ * model. */
+static const real SURPRISE = 10;
 /* rms error over the path, if it gave way to an independent one of the same size: sqrt(2). */
 static const real REDRAWN = (real)1.4142135623730951;
 /* A noise so far beyond the disturbance that x foretells, which is so far below the usual one, has
@@ -13,10 +14,10 @@ static const real FOREIGN = 16;
 static const real FADES = (real)0.5;
 /* A surprise is located to this part of a block. */
 enum { EIGHTHS = 8 };
-/* A fit begins when this share of the data is new. */
-static const real NEWS = (real)0.125;
-/* Operations of a factorisation in a block, 2^26. */
-static const double WORK = 67108864;
+/* At most so many steps of conjugate gradients in a block, until what is missing is this share of
+ * the doubt. */
+enum { PLANT_STEPS = 8 };
+static const real ENOUGH = (real)0.01;
 
 /* Correlations. Every sum is in the order of k, whatever the number of sums that are formed at
  * once. */
@@ -53,34 +54,19 @@ void correlate(real *restrict to, const real *restrict a, int32_t n, const real 
 
 /* Layout. */
 
-static int32_t whole(int32_t n) { return (n + PARTS - 1) / PARTS * PARTS; }
-
-/* G is the lower triangle, one row after the other, in groups of PARTS rows that all end with the
- * group's last column. */
-static real *row_of_data(const posterior *f, int32_t i)
-{
-    const int32_t group = i / PARTS;
-    return f->G + times(group, group + 1) * (PARTS * PARTS / 2) +
-           times(i % PARTS, group + 1) * PARTS;
-}
-
-/* The factor has the same groups, each with its columns one after the other: a panel. */
-static real *panel_of(const posterior *f, int32_t group)
-{
-    return f->factor + times(group, group + 1) * (PARTS * PARTS / 2);
-}
-
 void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, anc_layout *at)
 {
     const int32_t K = s->K, J = s->J, I = s->I, M = s->M, N = s->L + M - 1;
-    const int32_t n = I * N + (exact ? 0 : J * M);
-    const int32_t groups = whole(n) / PARTS;
-    *f = (posterior){.K = K, .J = J, .I = I, .N = N, .M = M, .B = block, .n = n, .exact = exact};
-    f->padded = whole(n);
-    f->history = s->L + N + block;
-    f->width = 3 * N + block;
-    f->delay = (int32_t)((double)n * n * n / 3 / WORK);
+    const int32_t C = I + (exact ? 0 : J), draws = exact ? 0 : DRAWS, rows = K + draws;
+    *f = (posterior){.K = K, .J = J, .I = I, .N = N, .M = M, .B = block, .exact = exact};
+    f->n = I * N + (exact ? 0 : J * M);
+    f->C = C;
+    f->rows = rows;
+    f->history = N + block;
+    f->width = N + block;
     f->path = s->path;
+    layout_fourier(&f->fourier, N, at);
+    const int32_t spectrum = f->fourier.spectrum;
     f->numbers = structs(at, "posterior", ANC_STATE, 1, 1, 1, sizeof *f->numbers);
     f->counts = int32s(at, "posterior_counts", ANC_STATE, POSTERIOR_COUNTS);
     f->fits = int32s(at, "fits", ANC_STATE, 1);
@@ -88,29 +74,75 @@ void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, 
     f->z = reals(at, "history", ANC_STATE, 1, 1, I + J, f->history);
     f->errors = reals(at, "block_errors", ANC_STATE, 1, 1, K, block);
     f->heard = int32s(at, "block_counts", ANC_STATE, BLOCK_COUNTS);
-    f->theta = reals(at, "theta", ANC_STATE, 1, 1, K, n);
+    f->theta = reals(at, "theta", ANC_STATE, 1, 1, K, f->n);
     f->q = reals(at, "noise", ANC_STATE, 1, 1, 1, K);
-    f->draws = reals(at, "draws", ANC_STATE, 1, 1, exact ? 0 : DRAWS, n);
-    f->G = reals(at, "data", ANC_STATE, 1, groups, groups + 1, PARTS * PARTS / 2);
-    f->r = reals(at, "data_of_errors", ANC_STATE, 1, 1, K, n);
+    f->T = reals(at, "data", ANC_STATE, 1, C, C, N);
+    f->r = reals(at, "data_of_errors", ANC_STATE, 1, rows, C, N);
     f->ee = reals(at, "error_energy", ANC_STATE, 1, 1, 1, K);
-    f->factor = reals(at, "factor", ANC_STATE, 1, groups, groups + 1, PARTS * PARTS / 2);
-    f->inverse = reals(at, "inverse_diagonal", ANC_STATE, 1, 1, 1, f->padded);
-    f->set_r = reals(at, "set_aside_of_errors", ANC_STATE, 1, 1, K, n);
-    f->set_ee = reals(at, "set_aside_energy", ANC_STATE, 1, 1, 1, K);
-    f->ss = reals(at, "path_correlation", ANC_STATE, 1, J, J, 2 * M - 1);
-    f->ps = reals(at, "cross_correlation", ANC_STATE, 1, I, J, N + M - 1);
-    f->sides = reals(at, "right_sides", ANC_SCRATCH, 1, 1, f->padded + J * M, PARTS);
+    f->before = reals(at, "before_data", ANC_STATE, 1, 1, C, N);
+    f->solution = reals(at, "solution", ANC_STATE, 1, rows, C, N);
+    f->unit = reals(at, "prior_draws", ANC_STATE, 1, draws, C, N);
+    f->T_at = reals(at, "data_spectra", ANC_SCRATCH, 1, C, C, spectrum);
+    f->factor = reals(at, "data_factor", ANC_SCRATCH, 1, C, C, spectrum);
+    f->ahead_at = reals(at, "newest_spectra", ANC_SCRATCH, 1, 1, C, spectrum);
+    f->before_at = reals(at, "before_spectra", ANC_SCRATCH, 1, 1, C, spectrum);
+    f->spectra = reals(at, "posterior_spectra", ANC_SCRATCH, 1, 1, C + 1, spectrum);
+    f->products = reals(at, "posterior_products", ANC_SCRATCH, 1, 1, C, spectrum);
+    f->next_q = reals(at, "next_noise", ANC_SCRATCH, 1, 1, 1, K);
+    f->taper = reals(at, "taper", ANC_SCRATCH, 1, 1, 1, N);
+    f->faded = reals(at, "faded", ANC_SCRATCH, 1, 1, C, block + N - 1);
+    f->right = reals(at, "right_side", ANC_SCRATCH, 1, 1, C, N);
+    f->vectors = reals(at, "posterior_vectors", ANC_SCRATCH, 1, 4, C, N);
     f->work = reals(at, "posterior_work", ANC_SCRATCH, 1, 1, POSTERIOR_ROWS, f->width);
+}
+
+static real *work_of(const posterior *f, int32_t row) { return f->work + times(row, f->width); }
+
+/* Return the taps of signal c in a row of vectors. */
+static real *taps_of(const posterior *f, real *vectors, int32_t row, int32_t c)
+{
+    return vectors + times(row * f->C + c, f->N);
+}
+
+/* Return how many taps signal c has. */
+static int32_t taps_in(const posterior *f, int32_t c) { return c < f->I ? f->N : f->M; }
+
+/* Return where signal c is in a theta. */
+static int32_t place_in_theta(const posterior *f, int32_t c)
+{
+    return c < f->I ? c * f->N : f->I * f->N + (c - f->I) * f->M;
+}
+
+/* Return s^ of microphone k in place of signal c. */
+static const real *given_path(const posterior *f, int32_t k, int32_t c)
+{
+    return f->path + times(k * f->J + c - f->I, f->M);
+}
+
+/* Return a random sign: the upper bit of a linear congruential generator. */
+static real sign_of(int32_t *random)
+{
+    const uint32_t next = (uint32_t)*random * 1664525u + 1013904223u;
+    memcpy(random, &next, sizeof next);
+    return next >> 31 ? 1 : -1;
 }
 
 void start_posterior(posterior *f, real spread)
 {
-    const int32_t split = f->I * f->N, taps = f->n - split;
     f->numbers->spread = spread;
+    f->numbers->significant = 1;
     f->counts[RANDOM] = 1;
-    for (int32_t k = 0; taps && k < f->K; k++)
-        copy(f->theta + times(k, f->n) + split, f->path + times(k, taps), (size_t)taps);
+    start_fourier(&f->fourier);
+    for (int32_t k = 0; k < f->K; k++)
+        for (int32_t c = f->I; c < f->C; c++)
+            copy(f->theta + times(k, f->n) + place_in_theta(f, c), given_path(f, k, c),
+                 (size_t)f->M);
+    for (int32_t row = 0; row < f->rows - f->K; row++)
+        for (int32_t c = 0; c < f->C; c++)
+            for (int32_t i = 0; i < f->N; i++) {
+                const real sign = sign_of(f->counts + RANDOM);
+                if (i < taps_in(f, c)) taps_of(f, f->unit, row, c)[i] = sign;
+            }
 }
 
 /* Return the mean of sum_m s(m)^2 over the secondary paths. */
@@ -132,297 +164,217 @@ static real mean_noise(const posterior *f)
     return sum / (real)f->K;
 }
 
-static real *work_of(const posterior *f, int32_t row) { return f->work + times(row, f->width); }
+/* A fit. */
 
-/* A fit: theta = (G + q P)^-1 (r + q P mean), with the precision P of the prior. */
-
-/* Return the precision of element i. */
-static real precision_of(const posterior *f, int32_t i, real size)
+/* Return the precision of the taps of signal c. */
+static real precision_of(const posterior *f, int32_t c)
 {
-    const real spread = f->numbers->spread;
-    return i < f->I * f->N ? f->numbers->prior : (real)f->M / (spread * spread * size);
+    return c < f->I ? f->numbers->prior : f->numbers->prior_s;
 }
 
-/* Return p'G p of microphone k, the energy of p * x in the data. */
-static real energy_explained(const posterior *f, int32_t k)
-{
-    const int32_t split = f->I * f->N;
-    const real *theta = f->theta + times(k, f->n);
-    real energy = 0;
-    for (int32_t i = 0; i < split; i++) {
-        const real *row = row_of_data(f, i);
-        energy += theta[i] * (2 * dot(row, theta, i) + row[i] * theta[i]);
-    }
-    return energy;
-}
-
-/* Return the energy of p * x in the data, at all microphones. */
-static real explained(const posterior *f)
-{
-    real energy = 0;
-    for (int32_t k = 0; k < f->K; k++) energy += energy_explained(f, k);
-    return energy;
-}
-
-/* Set what the data hold: samples, energy of x, energy of y. */
-static void weigh_data(const posterior *f, real held[3])
-{
-    const int32_t split = f->I * f->N;
-    held[0] = f->numbers->samples;
-    held[1] = held[2] = 0;
-    for (int32_t i = 0; i < split; i += f->N) held[1] += row_of_data(f, i)[i];
-    for (int32_t i = split; i < f->n; i += f->M) held[2] += row_of_data(f, i)[i];
-}
-
-/* Return whether there is news: of the samples, or of the energy of x or y. */
-static int is_news(const posterior *f)
-{
-    real held[3];
-    weigh_data(f, held);
-    for (int i = 0; i < 3; i++)
-        if (held[i] * (1 - NEWS) > f->numbers->fitted[i]) return 1;
-    return 0;
-}
-
-/* Set the precision of the primary paths from |p|^2 = E[d^2 + e^2] / E[x^2] of the data of now, and
- * the first noise. Return 0 if nothing can be told yet. */
+/* Set the precisions: of the primary paths from |p|^2 = E[d^2 + e^2] / E[x^2] of the data of now.
+ * Set the first noise. Return 0 if nothing can be told yet. */
 static int set_prior(posterior *f)
 {
     posterior_numbers *known = f->numbers;
     real x2 = 0, e2 = 0, q = 0;
-    for (int32_t i = 0; i < f->I * f->N; i++) x2 += row_of_data(f, i)[i];
+    for (int32_t i = 0; i < f->I; i++) x2 += f->T[times(i * f->C + i, f->N)];
     for (int32_t k = 0; k < f->K; k++) {
         if (!(f->ee[k] > 0)) return 0;
         e2 += f->ee[k];
         q += f->q[k];
     }
     if (!(x2 > 0)) return 0;
-    known->prior = x2 * (real)f->K / (e2 + explained(f));
+    known->prior_s = (real)f->M / (known->spread * known->spread * size_of_path(f));
+    const real prior = x2 * (real)f->N * (real)f->K / (e2 + known->explained);
+    /* A solution of soft data is no start for that of loud ones, but the prior is. */
+    f->counts[FRESH] |= prior > LOUDER * known->prior;
+    known->prior = prior;
     for (int32_t k = 0; q == 0 && k < f->K; k++) f->q[k] = (real)1e-3 * f->ee[k] / known->samples;
     return 1;
 }
 
-/* Set aside the present data for a factorisation. */
-static void begin_fit(posterior *f)
+/* Set `to` to E'E t or S'S t off the Toeplitz product: the part of it at `from` to N - 1 lags. */
+static void leave_out(posterior *f, const real *edge, const real *T, real *out, int32_t from,
+                      int32_t until, real turn)
 {
-    posterior_numbers *known = f->numbers;
-    if (!set_prior(f)) return;
-    for (int32_t group = 0; group < f->padded / PARTS; group++) {
-        const real *rows = row_of_data(f, group * PARTS);
-        real *panel = panel_of(f, group);
-        const int32_t columns = PARTS * (group + 1);
-        for (int32_t c = 0; c < columns; c++)
-            for (int32_t i = 0; i < PARTS; i++)
-                panel[PARTS * c + i] = rows[times(i, columns) + (size_t)c];
-    }
-    copy(f->set_r, f->r, times(f->K, f->n));
-    copy(f->set_ee, f->ee, (size_t)f->K);
-    known->set_aside = known->samples;
-    weigh_data(f, known->fitted);
-    f->counts[PENDING] = f->delay + 1;
-    f->counts[GROUPS] = 0;
+    const fourier *F = &f->fourier;
+    const size_t each = (size_t)F->spectrum;
+    real *sums = f->spectra + times(f->C, F->spectrum), *rows = F->work + 2 * (F->F + 2);
+    clear(sums, each);
+    for (int32_t c = 0; c < f->C; c++)
+        add_product(F, sums, edge + (size_t)c * each, T + (size_t)c * each, 1, -turn);
+    transform_back(F, rows, sums);
+    clear(rows, (size_t)from);
+    transform(F, sums, rows, until);
+    for (int32_t c = 0; c < f->C; c++)
+        add_product(F, out + (size_t)c * each, edge + (size_t)c * each, sums, -1, turn);
 }
 
-/* Set S_ji = sum_k P_kj Q_ki, k < n: a square of PARTS by PARTS sums, WIDE of its rows at a time.
- */
-static void multiply_panels(real S[PARTS * PARTS], const real *restrict P, const real *restrict Q,
-                            int32_t n)
+/* Set to = (G + q P) t, or without the prior. */
+static void multiply_data(posterior *f, real *to, const real *t, real q)
 {
-    for (int row = 0; row < PARTS; row += WIDE) {
-        vector sum[WIDE][VECTORS];
-        for (int j = 0; j < WIDE; j++)
-            for (int v = 0; v < VECTORS; v++) sum[j][v] = zero;
-        for (int32_t k = 0; k < n; k++)
-            for (int j = 0; j < WIDE; j++)
-                for (int v = 0; v < VECTORS; v++)
-                    sum[j][v] += P[PARTS * k + row + j] * vectors(Q + PARTS * k)[v];
-        for (int j = 0; j < WIDE; j++)
-            for (int v = 0; v < VECTORS; v++) vectors_of(S + PARTS * (row + j))[v] = sum[j][v];
+    const fourier *F = &f->fourier;
+    const int32_t C = f->C, N = f->N;
+    const size_t each = (size_t)F->spectrum;
+    real *T = f->spectra, *out = f->products;
+    for (int32_t c = 0; c < C; c++) transform(F, T + (size_t)c * each, t + times(c, N), N);
+    clear(out, (size_t)C * each);
+    for (int32_t a = 0; a < C; a++)
+        for (int32_t c = 0; c < C; c++)
+            add_product(F, out + (size_t)a * each, f->T_at + times(a * C + c, F->spectrum),
+                        T + (size_t)c * each, 1, 1);
+    leave_out(f, f->ahead_at, T, out, 1, N, 1);
+    leave_out(f, f->before_at, T, out, 0, N - 1, -1);
+    real *part = F->work + 2 * (F->F + 2);
+    for (int32_t c = 0; c < C; c++) {
+        const int32_t n = taps_in(f, c);
+        const real ridge = q * precision_of(f, c);
+        real *restrict sums = to + times(c, N);
+        transform_back(F, part, out + (size_t)c * each);
+        for (int32_t i = 0; i < n; i++)
+            sums[i] = part[i] + ridge * f->taper[i] * f->taper[i] * t[times(c, N) + (size_t)i];
+        clear(sums + n, (size_t)(N - n));
     }
 }
 
-/* Set element j of PARTS equations at once, X_j = (X_j - S_j - sum_(k < j) C_jk X_k) / C_jj,
- * without the division. */
-static void eliminate(real *restrict X, const real *restrict S, const real *restrict C, int j)
+static void multiply_posterior(void *self, real *to, const real *t)
 {
-    for (int i = 0; i < PARTS; i++) X[PARTS * j + i] -= S[PARTS * j + i];
-    for (int k = 0; k < j; k++)
-        for (int i = 0; i < PARTS; i++) X[PARTS * j + i] -= C[PARTS * k + j] * X[PARTS * k + i];
+    multiply_data(self, to, t, mean_noise(self));
 }
 
-/* Factorise the next group of rows; return 0 if the matrix is not positive definite. */
-static int factorise_group(posterior *f, int32_t group, real q, real size)
+static void precondition_posterior(void *self, real *to, const real *r)
 {
-    real S[PARTS * PARTS], *panel = panel_of(f, group);
-    for (int i = 0; i < PARTS; i++) {
-        const int32_t row = PARTS * group + i;
-        panel[PARTS * row + i] += row < f->n ? q * precision_of(f, row, size) : 1;
+    posterior *f = self;
+    const fourier *F = &f->fourier;
+    const size_t each = (size_t)F->spectrum;
+    real *part = F->work + 2 * (F->F + 2);
+    for (int32_t c = 0; c < f->C; c++)
+        transform(F, f->spectra + (size_t)c * each, r + times(c, f->N), f->N);
+    solve_spectra(F, f->factor, f->spectra, f->C);
+    clear(to, times(f->C, f->N));
+    for (int32_t c = 0; c < f->C; c++) {
+        transform_back(F, part, f->spectra + (size_t)c * each);
+        copy(to + times(c, f->N), part, (size_t)taps_in(f, c));
     }
-    for (int32_t before = 0; before <= group; before++) {
-        const real *other = panel_of(f, before), *C = other + PARTS * PARTS * before;
-        real *X = panel + PARTS * PARTS * before, *inverse = f->inverse + PARTS * before;
-        multiply_panels(S, other, panel, PARTS * before);
-        for (int j = 0; j < PARTS; j++) {
-            eliminate(X, S, before < group ? C : X, j);
-            if (before == group) {
-                const real pivot = X[PARTS * j + j];
-                if (!(pivot > 0 && isfinite(pivot))) return 0;
-                inverse[j] = 1 / root(pivot);
-            }
-            for (int i = 0; i < PARTS; i++) X[PARTS * j + i] *= inverse[j];
+}
+
+/* Set the spectra of the data. */
+static void prepare(posterior *f, real q)
+{
+    const fourier *F = &f->fourier;
+    const int32_t C = f->C, N = f->N;
+    for (int32_t a = 0; a < C; a++)
+        for (int32_t c = 0; c < C; c++) {
+            const real *ahead = f->T + times(c * C + a, N), *behind = f->T + times(a * C + c, N);
+            real *factor = f->factor + times(a * C + c, F->spectrum);
+            transform_lags(F, f->T_at + times(a * C + c, F->spectrum), ahead, behind, N, 0);
+            transform_lags(F, factor, ahead, behind, N, 1);
+            const real ridge = a == c ? q * precision_of(f, c) : 0;
+            for (int32_t k = 0; k < F->bins; k++) factor[k] += ridge;
+        }
+    factorise_spectra(F, f->factor, C);
+    for (int32_t c = 0; c < C; c++) {
+        transform(F, f->ahead_at + times(c, F->spectrum), f->faded + times(c, f->B + N - 1), N);
+        transform(F, f->before_at + times(c, F->spectrum), f->before + times(c, N), N - 1);
+    }
+}
+
+/* Set the right side of a row, r + q P mean; at the first fit to new data, begin with the prior. */
+static void set_right(posterior *f, int32_t row, real q, int first)
+{
+    for (int32_t c = 0; c < f->C; c++) {
+        const real *r = taps_of(f, f->r, row, c), ridge = q * precision_of(f, c);
+        real *restrict right = f->right + times(c, f->N), *t = taps_of(f, f->solution, row, c);
+        const real *unit = row < f->K ? NULL : taps_of(f, f->unit, row - f->K, c);
+        const real *given = row < f->K && c >= f->I ? given_path(f, row, c) : NULL;
+        for (int32_t i = 0; i < taps_in(f, c); i++) {
+            const real pull = unit    ? root(ridge) * f->taper[i] * unit[i]
+                              : given ? ridge * f->taper[i] * given[i]
+                                      : 0;
+            right[i] = r[i] + pull;
+            if (first) t[i] = ridge > 0 ? pull / (ridge * f->taper[i] * f->taper[i]) : 0;
         }
     }
-    return 1;
 }
 
-/* Solve C Z = Z for PARTS right sides. */
-static void solve_forward(const posterior *f, real *Z)
+/* Return the noise of a microphone from the residual sum e^2 - 2 theta'r + theta'G theta; `rest` is
+ * what the equations of its row leave. */
+static real noise_of(posterior *f, int32_t k, real q, const real *rest)
 {
-    real S[PARTS * PARTS];
-    for (int32_t group = 0; group < f->padded / PARTS; group++) {
-        const real *panel = panel_of(f, group);
-        real *X = Z + PARTS * PARTS * group;
-        multiply_panels(S, panel, Z, PARTS * group);
-        for (int j = 0; j < PARTS; j++) {
-            eliminate(X, S, panel + PARTS * PARTS * group, j);
-            for (int i = 0; i < PARTS; i++) X[PARTS * j + i] *= f->inverse[PARTS * group + j];
+    const real samples = f->numbers->samples, n = (real)f->n;
+    real residual = f->ee[k];
+    for (int32_t c = 0; c < f->C; c++) {
+        const real *t = taps_of(f, f->solution, k, c), *r = taps_of(f, f->r, k, c);
+        const real *right = f->right + times(c, f->N), ridge = q * precision_of(f, c);
+        for (int32_t i = 0; i < taps_in(f, c); i++) {
+            const real pull = ridge * f->taper[i] * f->taper[i] * t[i];
+            residual += t[i] * (right[i] - rest[times(c, f->N) + (size_t)i] - pull - 2 * r[i]);
         }
     }
-}
-
-/* Solve C' Z = Z. */
-static void solve_backward(const posterior *f, real *Z)
-{
-    for (int32_t group = f->padded / PARTS - 1; group >= 0; group--) {
-        const real *panel = panel_of(f, group), *C = panel + PARTS * PARTS * group;
-        real *restrict X = Z + PARTS * PARTS * group;
-        for (int j = PARTS - 1; j >= 0; j--) {
-            for (int k = j + 1; k < PARTS; k++)
-                for (int i = 0; i < PARTS; i++)
-                    X[PARTS * j + i] -= C[PARTS * j + k] * X[PARTS * k + i];
-            for (int i = 0; i < PARTS; i++) X[PARTS * j + i] *= f->inverse[PARTS * group + j];
-        }
-        vector x[PARTS][VECTORS];
-        for (int j = 0; j < PARTS; j++)
-            for (int v = 0; v < VECTORS; v++) x[j][v] = vectors(X + PARTS * j)[v];
-        for (int32_t c = 0; c < PARTS * group; c++)
-            for (int v = 0; v < VECTORS; v++) {
-                vector rest = vectors(Z + PARTS * c)[v];
-                for (int j = 0; j < PARTS; j++) rest -= panel[PARTS * c + j] * x[j][v];
-                vectors_of(Z + PARTS * c)[v] = rest;
-            }
-    }
-}
-
-/* Return a random sign: the upper bit of a linear congruential generator. */
-static real sign_of(int32_t *random)
-{
-    const uint32_t next = (uint32_t)*random * 1664525u + 1013904223u;
-    memcpy(random, &next, sizeof next);
-    return next >> 31 ? 1 : -1;
-}
-
-/* The prior mean of element i of theta, of microphone k: 0 of p, s^ of s. */
-static real prior_mean(const posterior *f, int32_t k, int32_t i)
-{
-    const int32_t split = f->I * f->N;
-    return i < split ? 0 : f->path[times(k, f->n - split) + (size_t)(i - split)];
-}
-
-/* Set the noise of microphone k from sum e^2 - 2 theta'r + theta'G theta, where
- * G theta = r + q P (mean - theta). */
-static void set_noise(posterior *f, int32_t k, real q, real size)
-{
-    const int32_t n = f->n, split = f->I * f->N;
-    const real *theta = f->theta + times(k, n), *r = f->set_r + times(k, n);
-    const real ee = f->set_ee[k], samples = f->numbers->set_aside;
-    real bend = 0;
-    for (int32_t i = 0; i < n; i++)
-        bend += precision_of(f, i, size) * theta[i] * (prior_mean(f, k, i) - theta[i]);
-    const real residual = ee - dot(theta, r, n) + q * bend;
     /* The earlier estimate counts as n samples: a short record leaves little noise by chance. */
-    const real weight = larger(samples - (real)split / 2, 0) + (real)n;
-    const real noise = (residual + (real)n * f->q[k]) / weight;
-    f->q[k] = larger(noise, (real)1e-6 * ee / samples);
-}
-
-/* Solve for the means of up to PARTS microphones from `first` on, and set their noise. Return 0 if
- * a mean is not finite. */
-static int solve_means(posterior *f, int32_t first, real q, real size)
-{
-    const int32_t n = f->n, split = f->I * f->N;
-    const int32_t most = f->K - first < PARTS ? f->K - first : PARTS;
-    real *Z = f->sides;
-    clear(Z, times(f->padded, PARTS));
-    for (int32_t c = 0; c < most; c++)
-        for (int32_t i = 0; i < n; i++) {
-            const real mean = prior_mean(f, first + c, i);
-            const real pull = i < split ? 0 : q * precision_of(f, i, size) * mean;
-            Z[PARTS * i + c] = f->set_r[times(first + c, n) + (size_t)i] + pull;
-        }
-    solve_forward(f, Z);
-    solve_backward(f, Z);
-    for (int32_t i = 0; i < n * PARTS; i++)
-        if (!isfinite(Z[i])) return 0;
-    for (int32_t c = 0; c < most; c++) {
-        real *theta = f->theta + times(first + c, n);
-        for (int32_t i = 0; i < n; i++) theta[i] = Z[PARTS * i + c];
-        set_noise(f, first + c, q, size);
-    }
-    return 1;
-}
-
-/* Draw from the posterior: theta has the covariance q (C C')^-1 = q C'^-1 C^-1. */
-static void set_draws(posterior *f, real q)
-{
-    const real scale = root(q);
-    real *Z = f->sides;
-    clear(Z, times(f->padded, PARTS));
-    for (int32_t d = 0; d < DRAWS; d++)
-        for (int32_t i = 0; i < f->n; i++) Z[PARTS * i + d] = sign_of(f->counts + RANDOM);
-    solve_backward(f, Z);
-    for (int32_t d = 0; d < DRAWS; d++)
-        for (int32_t i = 0; i < f->n; i++)
-            f->draws[times(d, f->n) + (size_t)i] = scale * Z[PARTS * i + d];
+    const real weight = larger(samples - (real)(f->I * f->N) / 2, 0) + n;
+    return larger((larger(residual, 0) + n * f->q[k]) / weight, (real)1e-6 * f->ee[k] / samples);
 }
 
 /* By chance alone, n taps explain n q. James and Stein: what is not significant is not played. */
 static void keep_significant(posterior *f)
 {
-    const int32_t split = f->I * f->N;
-    const real all = explained(f), chance = 2 * (real)split * (real)f->K * mean_noise(f);
-    const real share = all > chance ? 1 - chance / all : 0;
-    f->numbers->significant = share;
-    for (int32_t k = 0; k < f->K; k++)
-        for (int32_t i = 0; i < split; i++) f->theta[times(k, f->n) + (size_t)i] *= share;
-}
-
-/* The factor is complete: solve for the posterior. */
-static void end_fit(posterior *f, real q, real size)
-{
-    for (int32_t first = 0; first < f->K; first += PARTS)
-        if (!solve_means(f, first, q, size)) return;
-    keep_significant(f);
-    if (!f->exact) set_draws(f, q);
-    count_up(f->fits);
-    f->counts[WAITING] = f->counts[SILENT] = 0;
-    f->counts[STALE] = 1;
-}
-
-/* Do this block's part of the factorisation; every block does about as much. */
-static void go_on_fitting(posterior *f)
-{
-    const real q = mean_noise(f), size = size_of_path(f);
-    const double groups = f->padded / PARTS, blocks = f->delay + 1;
-    const double done = blocks + 1 - f->counts[PENDING], all = groups * groups * groups;
-    for (double g = f->counts[GROUPS]; g < groups && g * g * g * blocks < all * done; g++) {
-        if (!factorise_group(f, f->counts[GROUPS], q, size)) {
-            f->counts[PENDING] = 0;
-            return;
-        }
-        f->counts[GROUPS]++;
+    const int32_t split = f->I * f->N, all = f->C * f->N;
+    real explained = 0, *p = f->vectors, *product = f->vectors + all;
+    for (int32_t k = 0; k < f->K; k++) {
+        clear(p, (size_t)all);
+        copy(p, taps_of(f, f->solution, k, 0), (size_t)split);
+        multiply_data(f, product, p, 0);
+        explained += dot(p, product, all);
     }
-    if (--f->counts[PENDING] == 0) end_fit(f, q, size);
+    const real chance = 2 * (real)split * (real)f->K * mean_noise(f);
+    const real share = explained > chance ? 1 - chance / explained : 0;
+    f->numbers->significant = share;
+    f->numbers->explained = share * share * explained;
+}
+
+/* Set what is believed of the means. */
+static void set_theta(posterior *f)
+{
+    for (int32_t k = 0; k < f->K; k++)
+        for (int32_t c = 0; c < f->C; c++) {
+            const real *t = taps_of(f, f->solution, k, c);
+            const real share = c < f->I ? f->numbers->significant : 1;
+            real *theta = f->theta + times(k, f->n) + place_in_theta(f, c);
+            for (int32_t i = 0; i < taps_in(f, c); i++) theta[i] = share * t[i] * f->taper[i];
+        }
+}
+
+/* Return the energy of y in the data. */
+static real energy_of_control(const posterior *f)
+{
+    real energy = 0;
+    for (int32_t c = f->I; c < f->C; c++) energy += f->T[times(c * f->C + c, f->N)];
+    return energy;
+}
+
+/* Approach the posterior of the data; return 0 if nothing can be told yet. */
+static int approach_posterior(posterior *f)
+{
+    const int32_t all = f->C * f->N;
+    if (!set_prior(f)) return 0;
+    const real q = mean_noise(f);
+    const equations own = {f, multiply_posterior, precondition_posterior, all, f->vectors};
+    prepare(f, q);
+    for (int32_t row = 0; row < f->rows; row++) {
+        set_right(f, row, q, f->counts[FRESH]);
+        approach(&own, f->right, taps_of(f, f->solution, row, 0), PLANT_STEPS,
+                 ENOUGH * (row < f->K ? q : 1) * (real)f->n);
+        if (row < f->K) f->next_q[row] = noise_of(f, row, q, f->vectors);
+    }
+    copy(f->q, f->next_q, (size_t)f->K);
+    keep_significant(f);
+    set_theta(f);
+    count_up(f->fits);
+    f->counts[FRESH] = 0;
+    f->numbers->taught = energy_of_control(f);
+    return 1;
 }
 
 /* A block. */
@@ -459,89 +411,130 @@ static void explain(const posterior *f, const real *theta, real *d, real *z)
     }
 }
 
-/* Return the mean power over a block of what the draws say the errors may be. */
+/* Return the mean power over a block of what the draws say the errors may be; without draws, of
+ * what n unknown taps are worth. */
 static real power_of_doubt(const posterior *f)
 {
-    real *d = work_of(f, 1), *z = work_of(f, 2), doubt = 0;
-    for (int32_t draw = 0; draw < DRAWS; draw++) {
-        explain(f, f->draws + times(draw, f->n), d, z);
-        add_scaled(d, -1, z, f->B);
-        doubt += dot(d, d, f->B) / (real)f->B;
+    const real q = mean_noise(f);
+    real *sum = work_of(f, 1), *part = work_of(f, 0), *taps = work_of(f, 2), doubt = 0;
+    if (f->exact) return q * (real)f->n / f->numbers->samples;
+    for (int32_t row = f->K; row < f->rows; row++) {
+        clear(sum, (size_t)f->B);
+        for (int32_t c = 0; c < f->C; c++) {
+            const int32_t n = taps_in(f, c);
+            const real *t = taps_of(f, f->solution, row, c);
+            for (int32_t i = 0; i < n; i++) taps[i] = t[i] * f->taper[i];
+            correlate(part, taps, n, history_of(f, c), f->B);
+            add_scaled(sum, c < f->I ? 1 : -1, part, f->B);
+        }
+        doubt += dot(sum, sum, f->B) / (real)f->B;
     }
-    return doubt / (real)DRAWS;
+    return q * doubt / (real)DRAWS;
 }
 
-/* Let the data go. */
-static void forget_all(posterior *f)
+/* Set the taper, and the faded signals. */
+static void fade_signals(posterior *f, real forget)
 {
+    const real g = root(forget);
+    real share = 1;
+    for (int32_t i = 0; i < f->B + f->N - 1; i++) {
+        if (i < f->N) f->taper[i] = share;
+        for (int32_t c = 0; c < f->C; c++)
+            f->faded[times(c, f->B + f->N - 1) + (size_t)i] =
+                (c < f->I ? share : -share) * history_of(f, c)[i];
+        share *= g;
+    }
+}
+
+static const real *faded_of(const posterior *f, int32_t c)
+{
+    return f->faded + times(c, f->B + f->N - 1);
+}
+
+/* Let the data go, and begin with the newest samples of the block. */
+static void begin_data(posterior *f, int32_t newest)
+{
+    const int32_t C = f->C, N = f->N;
     posterior_numbers *known = f->numbers;
-    clear(f->G, times(f->padded, f->padded + PARTS) / 2);
-    clear(f->r, times(f->K, f->n));
+    clear(f->T, times(C * C, N));
+    clear(f->r, times(f->rows * C, N));
     clear(f->ee, (size_t)f->K);
-    clear(known->fitted, 3);
-    known->samples = 0;
-    f->counts[PENDING] = 0;
+    known->samples = known->explained = known->taught = 0;
+    f->counts[BEGUN] = f->counts[FRESH] = 1;
+    /* The N - 1 samples before the first row are in the lags. */
+    real *reversed = f->vectors;
+    clear(reversed, times(C, 2 * N));
+    for (int32_t c = 0; c < C; c++) {
+        real *before = f->before + times(c, N), *turned = reversed + times(c, 2 * N);
+        for (int32_t i = 0; i < N - 1; i++)
+            before[N - 2 - i] = turned[i] =
+                (c < f->I ? 1 : -1) * f->taper[i] * history_of(f, c)[newest + i];
+    }
+    for (int32_t a = 0; a < C; a++)
+        for (int32_t c = 0; c < C; c++)
+            add_lags(&f->fourier, f->T + times(a * C + c, N), reversed + times(a, 2 * N), N,
+                     reversed + times(c, 2 * N), N);
 }
 
-/* Let the part of G that is sum v(t - i) u(t - c), i < n, c < m, fade and take the newest B
- * samples: along the diagonals of the sums, the window of t moves by one sample. On the diagonal of
- * G, v is u. */
-static void add_products(posterior *f, int32_t B, const real *v, int32_t at_v, int32_t n,
-                         const real *u, int32_t at_u, int32_t m, real sign, real forget)
+/* Let numbers fade. */
+static void let_fade(real *sums, size_t n, real share)
 {
-    real *column = work_of(f, 2), *last = work_of(f, 3), *next = work_of(f, 4);
-    correlate(column, u, B, v, n); /* c = 0 */
-    if (v == u)
-        last[0] = column[0];
-    else
-        correlate(last, v, B, u, m); /* i = 0 */
-    real *restrict first = row_of_data(f, at_v) + at_u;
-    for (int32_t c = 0; c < (v == u ? 1 : m); c++)
-        first[c] = faded(first[c], forget, sign * last[c]);
-    for (int32_t i = 1; i < n; i++) {
-        const int32_t columns = v == u ? i + 1 : m;
-        real *restrict row = row_of_data(f, at_v + i) + at_u, *restrict sums = next;
-        const real *restrict before = last;
-        const real gone = v[B + i - 1], come = v[i - 1];
-        sums[0] = column[i];
-        row[0] = faded(row[0], forget, sign * column[i]);
-        for (int32_t c = 1; c < columns; c++) {
-            const real sum = before[c - 1] + (gone * u[B + c - 1] - come * u[c - 1]);
-            sums[c] = sum;
-            row[c] = faded(row[c], forget, sign * sum);
-        }
-        next = last;
-        last = sums;
-    }
+    for (size_t i = 0; i < n; i++) sums[i] = faded(sums[i], share, 0);
 }
 
-/* Let the data fade, and add the newest samples of the block. */
-static void add_samples(posterior *f, int32_t newest, real forget)
+/* Set `heard` to the faded errors of a row in the newest samples: what a microphone hears, or a
+ * draw's noise. What is not to be believed is what the row expects, with its noise: it changes
+ * nothing. */
+static void hear_row(posterior *f, int32_t row, int32_t newest, int believed, real *heard)
 {
-    const int32_t regressors = f->I + (f->exact ? 0 : f->J), B = f->B;
-    real *sums = work_of(f, 1);
-    for (int i = 0; i < 3; i++) f->numbers->fitted[i] *= forget;
-    f->numbers->samples = forget * f->numbers->samples + (real)newest;
-    for (int32_t k = 0; k < f->K; k++) {
-        const real *e = f->errors + times(k, B);
-        f->ee[k] = forget * f->ee[k] + dot(e, e, newest);
-    }
-    for (int32_t a = 0, row = 0; a < regressors; a++) {
-        const int32_t n = a < f->I ? f->N : f->M;
-        const real sign = a < f->I ? 1 : -1;
-        for (int32_t k = 0; k < f->K; k++) {
-            real *restrict r = f->r + times(k, f->n) + row;
-            correlate(sums, f->errors + times(k, B), newest, history_of(f, a), n);
-            for (int32_t i = 0; i < n; i++) r[i] = faded(r[i], forget, sign * sums[i]);
+    real *part = work_of(f, 1);
+    if (!believed) {
+        clear(heard, (size_t)newest);
+        for (int32_t c = 0; c < f->C; c++) {
+            correlate(part, taps_of(f, f->solution, row, c), taps_in(f, c), faded_of(f, c), newest);
+            add_to(heard, part, newest);
         }
-        for (int32_t b = 0, column = 0; b <= a; b++) {
-            const int32_t m = b < f->I ? f->N : f->M;
-            add_products(f, newest, history_of(f, a), row, n, history_of(f, b), column, m,
-                         b < f->I ? sign : -sign, forget);
-            column += m;
-        }
-        row += n;
+    } else if (row < f->K) {
+        const real *e = f->errors + times(row, f->B);
+        for (int32_t t = 0; t < newest; t++) heard[t] = work_of(f, 3)[t] * e[t];
+    } else
+        for (int32_t t = 0; t < newest; t++) heard[t] = sign_of(f->counts + RANDOM);
+}
+
+/* Let the data fade, and add the newest samples of the block, whose d^ has the energies `expected`.
+ */
+static void add_samples(posterior *f, int32_t newest, int believed, const real *expected,
+                        real forget)
+{
+    const int32_t C = f->C, N = f->N;
+    const real share = raised(forget, newest);
+    posterior_numbers *known = f->numbers;
+    real *heard = work_of(f, 2), *weight = work_of(f, 3), of_weights = 0, of_d = 0, w = 1;
+    for (int32_t t = 0; t < newest; t++) {
+        weight[t] = w;
+        w *= root(forget);
+        of_weights += weight[t] * weight[t];
+        of_d += weight[t] * weight[t] * expected[t];
     }
+    let_fade(f->before, times(C, N), root(share));
+    let_fade(f->T, times(C * C, N), share);
+    let_fade(f->r, times(f->K * C, N), share);
+    let_fade(taps_of(f, f->r, f->K, 0), times((f->rows - f->K) * C, N), root(share));
+    for (int32_t a = 0; a < C; a++)
+        for (int32_t c = 0; c < C; c++)
+            add_lags(&f->fourier, f->T + times(a * C + c, N), faded_of(f, a), newest,
+                     faded_of(f, c), N);
+    for (int32_t row = 0; row < f->rows; row++) {
+        hear_row(f, row, newest, believed, heard);
+        for (int32_t c = 0; c < C; c++)
+            add_lags(&f->fourier, taps_of(f, f->r, row, c), heard, newest, faded_of(f, c),
+                     taps_in(f, c));
+        if (row >= f->K) continue;
+        const real noise = believed ? 0 : f->q[row] * of_weights;
+        f->ee[row] = share * f->ee[row] + dot(heard, heard, newest) + noise;
+    }
+    known->samples = share * known->samples + of_weights;
+    known->explained = share * known->explained + of_d;
 }
 
 /* Energies of a block over the microphones, newest samples first: of what the posterior does not
@@ -603,118 +596,96 @@ static int32_t after_change(const posterior *f, const real *missed, real limit)
     }
 }
 
-/* Forget all if the plant has changed. Return the number of the newest samples to learn from. */
-static int32_t notice_surprise(posterior *f, const judgement *is, real q, real forget)
+/* Forget all if the plant has changed. Return how many of the newest samples are to be believed. */
+static int32_t notice_surprise(posterior *f, const judgement *is, int32_t newest, real forget)
 {
     posterior_numbers *known = f->numbers;
     const int32_t B = f->B, last = B - B * (EIGHTHS - 1) / EIGHTHS;
     const real each = (real)B * (real)f->K;
     const real missed = sum_of(is->missed, B), expected = sum_of(is->expected, B);
-    int32_t newest = B;
     /* The noise grows with the disturbance, as it did before, and falls as fast as a sound dies
      * away that is longer than the paths. */
     known->loud = larger(expected, FADES * known->loud);
     const real noise =
         known->expected > 0 ? known->missed / known->expected * known->loud / each : 0;
-    real limit = SURPRISE * larger(q, noise);
-    if (missed > limit * each) limit += SURPRISE * (f->exact ? 0 : power_of_doubt(f));
+    real limit = SURPRISE * larger(mean_noise(f), noise);
+    if (missed > limit * each) limit += SURPRISE * power_of_doubt(f);
     if (missed > limit * each) {
         const real in_last = sum_of(is->missed, last);
         const real foretold = FOREIGN * sum_of(is->expected, last);
-        const real usual = explained(f) / known->samples * (real)last;
+        const real usual = known->explained / larger(known->samples, 1) * (real)last;
         /* What is over already, or has no part of x, tells nothing of the plant. */
         if (in_last <= limit * (real)last * (real)f->K || (in_last > foretold && usual > foretold))
             return 0;
         newest = after_change(f, is->missed, limit * (real)f->K);
-        forget_all(f);
         count_up(f->alarms);
         known->spread = REDRAWN;
         f->counts[WAITING] = 1;
         f->counts[SILENT] = is->heard >= expected; /* the control does no good: listen to p alone */
+        begin_data(f, newest);
     }
+    forget = raised(forget, B);
     known->missed = forget * known->missed + (missed < expected ? missed : expected);
     known->expected = forget * known->expected + expected;
     return newest;
 }
 
-/* Learn from a block whose errors are all known; at least as many samples as a primary path has
- * taps have been heard. */
-static void learn_heard(posterior *f, real forget)
+/* Return whether the block has more energy of x than the data: what it is expected to be would then
+ * be more than what is known. */
+static int outweighs_data(const posterior *f)
 {
+    real block = 0, data = 0;
+    for (int32_t i = 0; i < f->I; i++) {
+        block += dot(history_of(f, i), history_of(f, i), f->B);
+        data += f->T[times(i * f->C + i, f->N)];
+    }
+    return block >= data || !(f->numbers->samples > 0);
+}
+
+/* Learn from the newest samples of a block; 0: its errors are not known. */
+static void learn_samples(posterior *f, int32_t newest, real forget)
+{
+    const int known = *f->fits && !f->counts[WAITING];
+    fade_signals(f, forget);
+    if (!f->counts[BEGUN] || (!newest && !known)) begin_data(f, newest);
+    if (!newest && !known) return;
     const judgement is = judge(f);
-    int32_t newest = f->B;
+    int32_t believed = newest;
     /* Judged is what was fitted to data that include the loudspeakers, unless they are silent. */
-    const int fitted = f->exact || f->numbers->fitted[2] > 0 || !is_loud(f);
-    if (*f->fits && !f->counts[WAITING] && fitted)
-        newest = notice_surprise(f, &is, mean_noise(f), forget);
-    add_samples(f, newest, forget);
-    if (!f->counts[PENDING] && newest == f->B && (f->counts[WAITING] || is_news(f))) begin_fit(f);
-    if (f->counts[PENDING]) go_on_fitting(f);
+    if (newest && known && (f->exact || f->numbers->taught > 0 || !is_loud(f)))
+        believed = notice_surprise(f, &is, newest, forget);
+    if (!believed && !f->counts[WAITING] && outweighs_data(f))
+        begin_data(f, 0);
+    else if (believed || !f->counts[WAITING])
+        add_samples(f, believed ? believed : f->B, believed > 0, is.expected, forget);
+    if (believed && approach_posterior(f) && believed == f->B)
+        f->counts[WAITING] = f->counts[SILENT] = 0;
 }
 
 void learn(posterior *f, real forget)
 {
-    if (!f->heard[MISSING] && f->heard[HEARD] >= f->N) learn_heard(f, forget);
     if (f->heard[HEARD] < 1 << 30) f->heard[HEARD] += f->B;
+    /* Rows whose delay lines are known; at first, as many as a path has taps. */
+    const int32_t rows = f->heard[HEARD] - f->N, begun = f->counts[BEGUN];
+    if (!begun && rows < f->N) return;
+    const int whole = !f->heard[MISSING] && (rows >= f->B || !begun);
+    learn_samples(f, !whole ? 0 : rows < f->B ? rows : f->B, forget);
 }
 
-/* Set `to` to a with zeros around it, `more` on either side. */
-static const real *widened(real *to, const real *a, int32_t n, int32_t more)
+void secondary_of(const posterior *f, int32_t row, int32_t j, real *to)
 {
-    clear(to, (size_t)more);
-    copy(to + more, a, (size_t)n);
-    clear(to + more + n, (size_t)more);
-    return to;
-}
-
-static void reverse(real *restrict to, const real *restrict a, int32_t n)
-{
-    for (int32_t i = 0; i < n; i++) to[i] = a[n - 1 - i];
-}
-
-/* Add the weighted correlations of one theta, with a share of its p. */
-static void expect_also(posterior *f, const real *theta, real weight, real of_p)
-{
-    const int32_t I = f->I, J = f->J, N = f->N, M = f->M;
-    const real *s = theta + times(I, N);
-    real *wide = work_of(f, 1), *sums = work_of(f, 2), *turned = work_of(f, 3);
-    for (int32_t j = 0; j < J; j++)
-        for (int32_t a = 0; a <= j; a++) {
-            correlate(sums, s + times(a, M), M, widened(wide, s + times(j, M), M, M - 1),
-                      2 * M - 1);
-            add_scaled(f->ss + times(j * J + a, 2 * M - 1), weight, sums, 2 * M - 1);
-        }
-    for (int32_t i = 0; i < I; i++) {
-        reverse(sums, theta + times(i, N), N);
-        widened(wide, sums, N, M - 1);
-        for (int32_t j = 0; j < J; j++) {
-            reverse(turned, s + times(j, M), M);
-            correlate(sums, turned, M, wide, N + M - 1);
-            add_scaled(f->ps + times(i * J + j, N + M - 1), weight * of_p, sums, N + M - 1);
-        }
+    const real scale = row < f->K ? 1 : root((real)f->K / (real)DRAWS * mean_noise(f));
+    if (f->exact) {
+        copy(to, given_path(f, row, f->I + j), (size_t)f->M);
+        return;
     }
+    const real *t = taps_of(f, f->solution, row, f->I + j);
+    for (int32_t i = 0; i < f->M; i++) to[i] = scale * t[i] * f->taper[i];
 }
 
-void expect(posterior *f)
+void primary_of(const posterior *f, int32_t row, int32_t i, real *to)
 {
-    const int32_t I = f->I, J = f->J, N = f->N, M = f->M, lags = 2 * M - 1;
-    const real share = (real)f->K / (real)DRAWS; /* the draws are of the mean noise */
-    clear(f->ss, times(J * J, lags));
-    clear(f->ps, times(I * J, N + M - 1));
-    for (int32_t k = 0; k < f->K; k++) {
-        const real *theta = f->theta + times(k, f->n);
-        if (f->exact) { /* theta has no s: put it after p */
-            real *both = f->sides;
-            copy(both, theta, times(I, N));
-            copy(both + times(I, N), f->path + times(k * J, M), times(J, M));
-            theta = both;
-        }
-        expect_also(f, theta, 1, 1);
-    }
-    for (int32_t draw = 0; !f->exact && draw < DRAWS; draw++)
-        expect_also(f, f->draws + times(draw, f->n), share, f->numbers->significant);
-    for (int32_t j = 0; j < J; j++)
-        for (int32_t a = 0; a < j; a++)
-            reverse(f->ss + times(a * J + j, lags), f->ss + times(j * J + a, lags), lags);
-    f->counts[STALE] = 0;
+    const real scale = row < f->K ? 1 : root((real)f->K / (real)DRAWS * mean_noise(f));
+    const real *t = taps_of(f, f->solution, row, i);
+    for (int32_t m = 0; m < f->N; m++) to[m] = f->numbers->significant * scale * t[m] * f->taper[m];
 }

@@ -1,240 +1,333 @@
-"""KF-PB: a posterior of the plant, the control filter of least expected error, and one price of power a loudspeaker.
+"""KF-PB: a posterior of the plant, the control filters of least expected error, and a price of power for each loudspeaker.
 
     y = v * x            asked of the loudspeakers
     e = p * x - s * y    heard by the microphones, and noise
 
-After every block of B samples: the posterior of p and s takes the block (`Plant`), and the filter of each loudspeaker in
-turn becomes the one of least expected error at the price of its power (`PowerBudget`). K microphones, J loudspeakers, I
+After every block of B samples: the posterior of p and s takes the block (`Plant`), and the filters of all loudspeakers
+become those of least expected error at the prices of their power (`PowerBudget`). K microphones, J loudspeakers, I
 references, L taps of a control filter, M of a secondary path, N = L + M - 1 of a primary path: all that control can
-reach. C_ab(l) = E[a(t) b(t - l)].
+reach. All sums are correlations of faded signals, and all products those of Toeplitz matrices, with period F.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 import numpy as np
 from oracles.signals import Controller
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_toeplitz, solve_triangular, toeplitz
 
-SURPRISE = 6.0  # error over the noise and the doubt that shows another plant
-REDRAWN = math.sqrt(2.0)  # rms error over the path, of a path that gave way to an independent one of the same size
-PARTS = 8  # of a block, in which a surprise is located
-NEWS = 1 / 8  # a fit begins if this share of the samples, or of the energy of x or y, is new
-FOREIGN = 16.0  # a noise so far beyond the disturbance that x foretells, which is so far below the usual one, has no part of x
-FADES = 0.5  # what a block leaves to the next of a sound that is longer than the paths
-DRAWS = 8  # of the posterior, that stand for its covariance
-MEMORY_S = 5.0  # time constant of forgetting
-WORK = 2.0**26  # operations of a factorisation in a block
-GROWTH = 10.0  # a sound does not grow by more from one sample to the next, but a click does
-CHEAPER, CHEAPEST = 4.0, 0.7  # what is left of the account makes power cheaper by so many times its share; the least
-WORTHWHILE = 0.5  # a rating of power must save at least this share of the measurement noise
-MOST = 1.04  # of the account, that is never exceeded: what goes beyond it is clipped
-WINDOWS, WINDOW_S = 8, 1.25  # windows of x in the averaging time, and a window's longest time constant
-SHORTER = 5  # a window for the level of x than that for its spectrum
-# Parts of the averaging time for which the powers of the last window and block may go on.
-WINDOW_LASTS, BLOCK_LASTS = 4, 20
+from kfopc_filterpy.controllers.kf_pb import MEMORY_S, WINDOW_S, WINDOWS
+from kfopc_filterpy.core.building import FOLDER
 
 
-def lagged(u, e, n):
-    """Return sum_t e(t) u(t - l), l < n, over the block e; u ends with the block."""
-    return np.correlate(u[len(u) - len(e) - n + 1 :], e, "valid")[::-1]
+def constants() -> dict[str, float]:
+    """Return the numbers that the core's sources name; of both builds, those of the one with doubles."""
+    named = r"\b([A-Z][A-Z_]*) = (?:\(real\))?([0-9.]+(?:e-?[0-9]+)?)f?\b"
+    text = "".join((FOLDER / name).read_text() for name in ("posterior.h", "posterior.c", "budget.c"))
+    return {name: float(value) for name, value in re.findall(named, text)}
 
 
-def gram(u, v, B, n, m):
-    """Return sum_t u(t - i) v(t - j), i < n, j < m, over the last B samples t."""
-    G = np.empty((n, m))
-    G[0], G[:, 0] = lagged(v, u[-B:], m), lagged(u, v[-B:], n)
-    # Newest first: at the end, before the block.
-    (a, b), (c, d) = (u[::-1], v[::-1]), (u[-B - 1 :: -1], v[-B - 1 :: -1])
-    for i in range(1, n):  # along the diagonals, the window of t moves by one sample
-        G[i, 1:] = G[i - 1, :-1] + c[i - 1] * d[: m - 1] - a[i - 1] * b[: m - 1]
-    return G
+_core = constants()
+SURPRISE, REDRAWN, FOREIGN = (_core[name] for name in ("SURPRISE", "REDRAWN", "FOREIGN"))
+FADES, LOUDER, ENOUGH = (_core[name] for name in ("FADES", "LOUDER", "ENOUGH"))
+PARTS, DRAWS, SHORTER = (int(_core[name]) for name in ("EIGHTHS", "DRAWS", "SHORTER"))
+PLANT_STEPS, FILTER_STEPS, PRICE_STEPS = (int(_core[name]) for name in ("PLANT_STEPS", "FILTER_STEPS", "PRICE_STEPS"))
+GROWTH, CHEAPER, CHEAPEST, WORTHWHILE = (_core[name] for name in ("GROWTH", "CHEAPER", "CHEAPEST", "WORTHWHILE"))
+MOST, PLANNED, LEAST_SHARE, PRICE_RISES = (_core[name] for name in ("MOST", "PLANNED", "LEAST_SHARE", "PRICE_RISES"))
+WINDOW_LASTS, BLOCK_LASTS, REGULAR = int(_core["WINDOW_LASTS"]), int(_core["BLOCK_LASTS"]), _core["REGULAR"]
+
+
+def period(n):
+    """Return the power of two that holds the lags of n taps of both signs."""
+    return 1 << math.ceil(math.log2(2 * n))
+
+
+def block_lags(u, v, n):
+    """Return sum over the block of u_a(t) v_c(t - l), l < n: u (A, B); v (C, B + n - 1) ends with the block."""
+    return np.array([[np.correlate(c, a, "valid")[::-1] for c in v[:, -u.shape[1] - n + 1 :]] for a in u])
+
+
+def two_sided(R, F):
+    """Return circular lags (A, A, F) from R_ab(l), l >= 0: R_ab(-l) = R_ba(l)."""
+    c, n = np.zeros((*R.shape[:2], F)), R.shape[2]
+    c[..., :n] = R
+    c[..., F - n + 1 :] = np.swapaxes(R, 0, 1)[..., :0:-1]
+    return c
+
+
+def spectra(R, F):
+    """Return the spectra of the adjoint lags, (A, A, F/2 + 1)."""
+    return np.fft.rfft(two_sided(np.swapaxes(R, 0, 1), F))
+
+
+def smoothed(X, n):
+    """Return the spectra of the circulant that is nearest to n of the lags: definite if their Toeplitz matrix is."""
+    F = 2 * (X.shape[2] - 1)
+    triangle = np.maximum(1 - np.minimum(np.arange(F), F - np.arange(F)) / n, 0)
+    return np.fft.rfft(np.fft.irfft(X, F) * triangle)
+
+
+def inverted(A):
+    """Return the inverses of small matrices (n, n, F/2 + 1)."""
+    return np.moveaxis(np.linalg.inv(np.moveaxis(A, 2, 0)), 0, 2)
 
 
 def filtered(h, u, B):
-    """Return the last B samples of h * u."""
-    return np.convolve(u[len(u) - B - len(h) + 1 :], h, "valid")
+    """Return the last B samples of sum_i h_i * u_i; h (I, n)."""
+    return sum((np.convolve(a[len(a) - B - len(b) + 1 :], b, "valid") for b, a in zip(h, u, strict=True)), np.zeros(B))
+
+
+def conjugate_gradients(product, precondition, b, v, steps, axes, enough=0.0):
+    """Return v after steps towards A v = b until `enough`, and b - A v; the scalars are sums over `axes`."""
+
+    def dot(a, c):
+        return np.sum(a * c, axis=axes, keepdims=True)
+
+    def ratio(a, c):
+        return np.where(c > 0, a / np.where(c > 0, c, 1.0), 0.0)
+
+    r = b - product(v)
+    p = z = precondition(r)
+    rz = dot(r, z)
+    for _ in range(steps):
+        q = product(p)
+        a = np.where(rz > enough, ratio(rz, dot(p, q)), 0.0)
+        v, r = v + a * p, r - a * q
+        z = precondition(r)
+        new = dot(r, z)
+        p, rz = z + ratio(new, rz) * p, new
+    return v, r
 
 
 class Plant:
-    """The Gaussian posterior of theta = [p, s], for all microphones: they hear the same regressors z = [x, -y]."""
+    """The Gaussian posterior of theta = [p, s], for all microphones: they hear the same regressors z = [x, -y].
+
+    Signals are faded, z(t) g^(age/2); theta is in these units, times g^(-i/2). So the data are G = T - E'E - S'S:
+    the Toeplitz matrix T of all lags less what it has beyond the newest sample and before the first row.
+    """
 
     def __init__(self, s, n_references, n_primary, block, spread, forget):
-        self.s_hat, self.s, self.B, self.forget, self.exact = s, s.copy(), block, forget, spread == 0
-        (K, J, M), I, N = s.shape, n_references, n_primary  # noqa: E741
-        self.widths = [N] * I + [M] * (0 if self.exact else J)
-        self.at = np.concatenate([[0], np.cumsum(self.widths)])
-        self.n = self.at[-1]
-        self.primary = slice(0, I * N)
-        self.size = np.mean(np.sum(s**2, axis=2))  # of a secondary path
-        self.spread = spread
-        self.theta, self.q = np.zeros((K, self.n)), np.zeros(K)
-        self.theta[:, I * N :] = 0.0 if self.exact else s.reshape(K, -1)
-        self.draws = np.zeros((DRAWS, self.n))  # of theta less its mean, for the mean noise; none yet
-        self.significant, self.random = 1.0, 1
-        self.delay = int(self.n**3 / 3 / WORK)  # blocks that a factorisation takes
-        self.waiting = self.silent = False  # waiting: no fit since a surprise
+        self.s_hat, self.I, self.N, self.B, self.forget, self.exact = (
+            s,
+            n_references,
+            n_primary,
+            block,
+            forget,
+            spread == 0,
+        )
+        K, J, M = s.shape
+        C, draws = n_references + (0 if self.exact else J), 0 if self.exact else DRAWS
+        self.F, self.g, self.spread = period(n_primary), forget ** (1 / block), spread
+        self.taper = self.g ** (np.arange(n_primary) / 2)
+        self.mask = np.ones((C, n_primary))
+        self.mask[self.I :, M:] = 0.0
+        self.n, self.random = np.sum(self.mask), 1
+        self.mean = np.zeros((K + draws, C, n_primary))
+        if not self.exact:
+            self.mean[:K, self.I :, :M] = s
+        self.theta = self.mean / self.taper
+        self.unit = self.signs(draws, C, n_primary) * self.mask
+        self.q, self.significant, self.precision = np.zeros(K), 1.0, np.zeros((C, 1))
+        self.waiting = self.silent = False  # waiting: no fit of a whole block since a surprise
         self.fits = self.surprises = 0
-        self.missed = self.expected = self.loud = 0.0
-        self.forget_all()
+        self.missed = self.expected = self.loud = self.taught = 0.0
+        self.T = None  # no data yet
 
-    def forget_all(self):
-        """Begin the data: G = sum z z', r = sum e z, sum e^2, and how many samples, all fading by `forget` a block."""
-        K, n = self.theta.shape
-        self.G, self.r, self.ee, self.count = np.zeros((n, n)), np.zeros((K, n)), np.zeros(K), 0.0
-        self.fitted, self.pending = np.zeros(3), None
+    def signs(self, *shape):
+        """Return random signs."""
+        signs = np.empty(shape)
+        for i in range(signs.size):
+            self.random = (self.random * 1664525 + 1013904223) % 2**32
+            signs.flat[i] = 1.0 if self.random >> 31 else -1.0
+        return signs
+
+    @property
+    def known(self):
+        """Return the posterior means in plain units, (K, C, N)."""
+        return self.theta[: len(self.q)] * self.taper
 
     @property
     def p(self):
-        """Return the primary paths, (K, I, N)."""
-        return self.theta[:, self.primary].reshape(len(self.theta), -1, self.widths[0])
+        """Return the primary paths, (K, I, N), as far as they are significant."""
+        return self.significant * self.known[:, : self.I]
 
-    def parts(self, theta):
-        """Return the filters of a vector: (I, N) of x, (J, M) of y."""
-        split = self.primary.stop
-        return theta[:split].reshape(-1, self.widths[0]), theta[split:].reshape(-1, self.s.shape[2])
+    @property
+    def s(self):
+        """Return the secondary paths, (K, J, M)."""
+        return self.s_hat if self.exact else self.known[:, self.I :, : self.s_hat.shape[2]]
 
-    def explain(self, theta, x, y):
-        """Return p * x and s * y of the block, for theta."""
-        p, s = self.parts(theta)
-        d = sum(filtered(h, u, self.B) for h, u in zip(p, x, strict=True))
-        z = sum((filtered(h, u, self.B) for h, u in zip(s, y, strict=not self.exact)), np.zeros(self.B))
-        return d, z
+    def begin(self, z, newest):
+        """Begin the data with the `newest` samples; z (C, N - 1 + B) ends with the block."""
+        N, rows = self.N, len(self.theta)
+        first = z[:, : z.shape[1] - newest][:, 1 - N :]
+        self.first = first * self.g ** (np.arange(N - 2, -1, -1) / 2)
+        self.T = block_lags(self.first, np.pad(self.first, [(0, 0), (N - 1, 0)]), N)
+        self.r, self.ee, self.count = np.zeros((rows, len(z), N)), np.zeros(len(self.q)), 0.0
+        self.explained, self.taught, self.fresh = 0.0, 0.0, True
 
-    def explained(self):
-        """Return sum d^2 of the data, over all microphones."""
-        p = self.theta[:, self.primary]
-        return np.sum(p @ self.G[self.primary, self.primary] * p)
-
-    def held(self):
-        """Return the samples of the data, and their energies of x and of y."""
-        energy = np.diag(self.G)[self.at[:-1]]
-        n = self.primary.stop // self.widths[0]
-        return np.array([self.count, np.sum(energy[:n]), np.sum(energy[n:])])
-
-    def learn(self, x, y, e):
-        """Take a block of errors e, (K, B)."""
-        heard = np.mean(e**2)
-        if self.exact:  # s^ is right: what it plays is no news
-            e = e + np.array([sum(filtered(h, u, self.B) for h, u in zip(s, y, strict=True)) for s in self.s_hat])
-        d, z = (np.array(each) for each in zip(*(self.explain(theta, x, y) for theta in self.theta), strict=True))
-        missed, d2, new = np.mean((e - d + z) ** 2, axis=0), np.mean(d**2, axis=0), self.B
-        loud = np.any(y[:, -self.B - self.s.shape[2] + 1 :])
-        if self.fits and not self.waiting and (self.exact or not loud or self.fitted[2] > 0):
-            usual = self.explained() / (self.count * len(e))
-            self.loud = max(np.mean(d2), FADES * self.loud)
-            usual_noise = self.missed / max(self.expected, 1e-300) * self.loud
-            limit = self.limit(max(np.mean(self.q), usual_noise), x, y)
-            ends = self.B * np.arange(1, PARTS + 1) // PARTS
-            of_part, d2_last = [np.mean(part) for part in np.split(missed, ends[:-1])], np.mean(d2[ends[-2] :])
-            if np.mean(missed) > limit:
-                foreign = of_part[-1] > FOREIGN * d2_last and FOREIGN * d2_last < usual
-                if foreign or of_part[-1] <= limit:
-                    new = 0  # none of x, or over already: it tells nothing of the plant
-                else:  # the plant is another one: begin again, with what was heard after the change
-                    new = self.B - ends[np.argmax(np.array(of_part) > limit)]
-                    self.forget_all()
-                    self.spread, self.waiting, self.surprises = REDRAWN, True, self.surprises + 1
-                    self.silent = heard >= np.mean(d2)  # the control does no good: listen to p alone
-            if new:
-                self.missed = self.forget * self.missed + min(np.mean(missed), np.mean(d2))
-                self.expected = self.forget * self.expected + np.mean(d2)
-        self.add(x, y, e, new)
-        due = self.waiting or np.any(self.held() * (1 - NEWS) > self.fitted)
-        if self.pending is None and new == self.B and due:
-            self.begin_fit()
-        if self.pending is not None:
-            self.pending[0] -= 1
-            if self.pending[0] < 0:
-                self.end_fit()
-
-    def limit(self, noise, x, y):
-        """Return the largest mean square that the noise and the doubt explain; the noise grows with the disturbance."""
-        draws = [] if self.exact else self.draws
-        doubt = sum(np.mean(np.subtract(*self.explain(draw, x, y)) ** 2) for draw in draws) / DRAWS
-        return SURPRISE * (noise + doubt)
-
-    def add(self, x, y, e, new):
-        """Add the last `new` samples of the block to the data."""
-        f = self.forget
-        self.G, self.r, self.fitted = f * self.G, f * self.r, f * self.fitted
-        self.ee, self.count = f * self.ee, f * self.count
-        if new == 0:
+    def learn(self, x, y, e, new):
+        """Take the `new` last samples of a block of errors e, (K, B), with which x and y end; 0: e is not known."""
+        B, I, known = self.B, self.I, self.fits and not self.waiting  # noqa: E741
+        z = np.concatenate([x, -y])[: len(self.mask), 1 - self.N - B :]
+        if self.T is None or not (new or known):
+            self.begin(z, new)
+        if not (new or known):
             return
-        e = e[:, -new:]
-        self.ee, self.count = self.ee + np.sum(e**2, axis=1), self.count + new
-        z = list(zip([*x, *(() if self.exact else -y)], self.at[:-1], self.widths, strict=True))
-        for i, (u, a, n) in enumerate(z):
-            for k in range(len(e)):
-                self.r[k, a : a + n] += lagged(u, e[k], n)
-            for v, b, m in z[i:]:
-                more = gram(u, v, new, n, m)
-                self.G[a : a + n, b : b + m] += more
-                if b > a:
-                    self.G[b : b + m, a : a + n] += more.T
+        d = np.array([filtered(p, z[:I], B) for p in self.p])
+        if new:
+            heard = np.mean(e**2)
+            if self.exact:  # s^ is right: what it plays is no news
+                e = e + np.array([filtered(s, y, B) for s in self.s_hat])
+            told = d + np.array([filtered(theta[I:], z[I:], B) for theta in self.known])
+            loud = np.any(y[:, -B - self.s_hat.shape[2] + 1 :])
+            if known and (self.exact or not loud or self.taught > 0):
+                new = self.judge(np.mean((e - told) ** 2, 0), np.mean(d**2, 0), heard, z)
+        if (
+            not new
+            and not self.waiting
+            and np.sum(z[:I, -B:] ** 2) >= (self.count > 0) * np.sum([self.T[i, i, 0] for i in range(I)])
+        ):
+            self.begin(z, 0)  # what it would stand for is more than what is known
+        elif new or not self.waiting:
+            self.add(z, d, e, new)
+        if new and self.fit() and new == B:
+            self.waiting = self.silent = False
 
-    def begin_fit(self):
-        """Set aside the data of now for a factorisation."""
-        n = self.primary.stop
-        x2 = np.mean(np.diag(self.G)[:n])
+    def judge(self, missed, d2, heard, z):
+        """Return how many of the newest samples are to be believed; forget all if they tell of another plant."""
+        ends = self.B * np.arange(1, PARTS + 1) // PARTS
+        self.loud = max(np.mean(d2), FADES * self.loud)
+        noise = max(np.mean(self.q), self.missed / max(self.expected, 1e-300) * self.loud)
+        if self.exact:
+            doubt = np.mean(self.q) * self.n / self.count
+        else:
+            draws = self.theta[len(self.q) :] * self.taper * math.sqrt(np.mean(self.q))
+            doubt = sum(np.mean(filtered(draw, z, self.B) ** 2) for draw in draws) / DRAWS
+        limit = SURPRISE * (noise + doubt)
+        new = self.B
+        if np.mean(missed) > limit:
+            of_part, last = [np.mean(part) for part in np.split(missed, ends[:-1])], np.mean(d2[ends[-2] :])
+            usual = self.explained / (max(self.count, 1.0) * len(self.q))
+            if of_part[-1] <= limit or (of_part[-1] > FOREIGN * last and FOREIGN * last < usual):
+                return 0  # over already, or none of x: it tells nothing of the plant
+            new = self.B - ends[np.argmax(np.array(of_part) > limit)]
+            self.spread, self.waiting, self.surprises = REDRAWN, True, self.surprises + 1
+            self.silent = heard >= np.mean(d2)  # the control does no good: listen to p alone
+            self.begin(z, new)
+        self.missed = self.forget * self.missed + min(np.mean(missed), np.mean(d2))
+        self.expected = self.forget * self.expected + np.mean(d2)
+        return new
+
+    def add(self, z, d, e, new):
+        """Add the block, or its newest samples; if there are none, what the posterior expects."""
+        N, rows = self.N, new or self.B
+        w = self.g ** (np.arange(rows - 1, -1, -1) / 2)
+        z = z[:, 1 - N - rows :] * self.g ** (np.arange(N + rows - 2, -1, -1) / 2)
+        if new:
+            of_rows = np.concatenate([e[:, -rows:] * w, self.signs(len(self.theta) - len(self.q), rows)[:, ::-1]])
+            energy = np.sum(of_rows[: len(self.q)] ** 2, 1)
+        else:  # nothing changes then
+            of_rows = np.array([filtered(theta, z, rows) for theta in self.theta])
+            energy = np.sum(of_rows[: len(self.q)] ** 2, 1) + self.q * np.sum(w**2)
+        f = self.g**rows
+        self.first = math.sqrt(f) * self.first
+        self.T = f * self.T + block_lags(z[:, 1 - rows - 1 :], z, N)
+        fade = np.where(np.arange(len(self.theta)) < len(self.q), f, math.sqrt(f))[:, None, None]
+        self.r = fade * self.r + block_lags(of_rows, z, N) * self.mask
+        self.ee, self.count = f * self.ee + energy, f * self.count + np.sum(w**2)
+        self.explained = f * self.explained + np.sum((d[:, -rows:] * w) ** 2)
+        self.newest = z[:, -N:]
+
+    def fit(self):
+        """Take some steps towards the posterior, and estimate the noise; return False if there is nothing to fit."""
+        K, I, N, F = len(self.q), self.I, self.N, self.F  # noqa: E741
+        x2 = np.mean([self.T[i, i, 0] for i in range(I)])
         if not (x2 > 0 and np.all(self.ee > 0)):
-            return
+            return False
         if not np.any(self.q):
             self.q = 1e-3 * self.ee / self.count
         # |p|^2 is expected to be E[d^2 + e^2] / E[x^2] of the data of now
-        prior = n * x2 * len(self.ee) / (np.sum(self.ee) + self.explained())
-        self.pending = [self.delay, self.G.copy(), self.r.copy(), self.ee.copy(), self.count, prior]
-        self.fitted = self.held()
+        prior = I * N * x2 * K / (np.sum(self.ee) + self.explained)
+        self.fresh |= prior > LOUDER * self.precision[0, 0]  # what soft data told is no start for loud ones
+        self.precision[:I] = prior
+        if not self.exact:
+            size = np.mean(np.sum(self.s_hat**2, axis=2))
+            self.precision[I:] = self.s_hat.shape[2] / (self.spread**2 * size)
+        q = np.mean(self.q)
+        ridge = q * self.precision * self.taper**2
+        b = self.r + ridge * self.mean / self.taper
+        b[K:] += np.sqrt(ridge) * self.unit  # draws over sqrt(q): they change little while q is learned
+        if self.fresh:  # from the prior on
+            self.theta = self.mean / self.taper
+            self.theta[K:] = self.unit / np.sqrt(ridge)
+        self.T_f = spectra(self.T, F)
+        smooth = smoothed(self.T_f, N)
+        self.E_f, self.S_f = (np.fft.rfft(u, F) for u in (self.newest, self.first))
+        inverse = inverted(smooth + q * self.precision[:, :, None] * np.eye(len(smooth))[:, :, None])
 
-    def end_fit(self):
-        """Solve for the posterior of the data set aside."""
-        _, G, r, ee, count, prior = self.pending
-        self.pending = None
-        p, n, q, K = self.primary, self.primary.stop, np.mean(self.q), len(r)
-        precision = np.full(self.n, prior)
-        precision[n:] = self.s.shape[2] / (self.spread**2 * self.size) if not self.exact else 0.0
-        C = cholesky(G + q * np.diag(precision), lower=True, check_finite=False)
-        mean = np.zeros((K, self.n))
-        mean[:, n:] = 0.0 if self.exact else self.s_hat.reshape(K, -1)
-        theta = self.theta = cho_solve((C, True), (r + q * precision * mean).T, check_finite=False).T
-        residual = ee - 2 * np.sum(theta * r, axis=1) + np.sum(theta @ G * theta, axis=1)
+        def precondition(r):
+            return np.fft.irfft(np.einsum("acf,kcf->kaf", inverse, np.fft.rfft(r, F)), F)[..., :N] * self.mask
+
+        enough = ENOUGH * self.n * np.where(np.arange(len(b)) < K, q, 1.0)[:, None, None]
+        self.theta, rest = conjugate_gradients(
+            lambda t: self.product(t) + ridge * t, precondition, b, self.theta, PLANT_STEPS, (1, 2), enough
+        )
+        theta = self.theta[:K]
+        G_theta = (b - rest - ridge * self.theta)[:K]
+        residual = np.maximum(self.ee + np.sum(theta * (G_theta - 2 * self.r[:K]), axis=(1, 2)), 0.0)
         # The noise, with the earlier estimate counting as n samples: a short record leaves little noise by chance.
-        self.q = np.maximum((residual + self.n * self.q) / (max(count - n / 2, 0.0) + self.n), 1e-6 * ee / count)
+        counted = max(self.count - I * N / 2, 0.0) + self.n
+        self.q = np.maximum((residual + self.n * self.q) / counted, 1e-6 * self.ee / self.count)
         # By chance alone, n taps explain n q. James and Stein: what is not significant is not played.
-        self.significant = max(0.0, 1.0 - 2 * n * np.sum(self.q) / max(self.explained(), 1e-300))
-        theta[:, p] *= self.significant
-        # Draws: theta has the covariance q (G + q prior)^-1 = q C'^-1 C^-1.
-        signs = np.reshape([self.sign() for _ in range(DRAWS * self.n)], (DRAWS, self.n))
-        self.draws = math.sqrt(q) * solve_triangular(C, signs.T, lower=True, trans=1, check_finite=False).T
-        if not self.exact:
-            self.s = theta[:, n:].reshape(self.s.shape)
-        self.fits, self.waiting, self.silent = self.fits + 1, False, False
+        of_x = theta * (np.arange(len(self.mask)) < I)[:, None]
+        explained = np.sum(of_x * self.product(of_x))
+        self.significant = max(0.0, 1.0 - 2 * I * N * np.sum(self.q) / max(explained, 1e-300))
+        self.explained = self.significant**2 * explained
+        self.fits, self.fresh = self.fits + 1, False
+        self.taught = np.sum([self.T[c, c, 0] for c in range(I, len(self.T))])
+        return True
 
-    def sign(self):
-        """Return a random sign."""
-        self.random = (self.random * 1664525 + 1013904223) % 2**32
-        return 1.0 if self.random >> 31 else -1.0
+    def product(self, t):
+        """Return G t."""
+        F, N, T = self.F, self.N, np.fft.rfft(t, self.F)
+        beyond = np.fft.irfft(np.einsum("cf,kcf->kf", self.E_f, T), F)[:, N : 2 * N - 1]
+        beyond = np.fft.rfft(np.pad(beyond, [(0, 0), (N, 0)]), F)
+        before = np.fft.rfft(np.fft.irfft(np.einsum("cf,kcf->kf", self.S_f, T), F)[:, : N - 1], F)
+        out = np.einsum("acf,kcf->kaf", self.T_f, T)
+        out = out - self.E_f.conj() * beyond[:, None] - self.S_f.conj() * before[:, None]
+        return np.fft.irfft(out, F)[..., :N] * self.mask
 
-    def correlations(self):
-        """Return E[s_j ~ s_j'](u), (J, J, 2M - 1), and E[p_i ~ s_j](u), (I, J, N + M - 1), summed over microphones.
+    def paths(self):
+        """Return rows of primary paths, (rows, I, N), and of secondary ones, whose sums are the posterior's expectations."""
+        K = len(self.q)
+        rows = self.theta * self.taper
+        rows[K:] *= math.sqrt(K / DRAWS * np.mean(self.q))  # draws are of the mean noise
+        return rows[:, : self.I], self.s_hat if self.exact else rows[:, self.I :, : self.s_hat.shape[2]]
 
-        a ~ b is sum_m a(m + u) b(m) for u = 1 - M on; E is over the posterior.
-        """
-        (K, J, M), (I, N) = self.s.shape, (self.p.shape[1], self.p.shape[2])  # noqa: E741
-        ss, ps = np.zeros((J, J, 2 * M - 1)), np.zeros((I, J, N + M - 1))
-        samples = [(1.0, 1.0, self.p[k], self.s[k]) for k in range(K)]
-        if not self.exact:
-            share = K / DRAWS  # draws are of the mean noise
-            samples += [(share, share * self.significant, *self.parts(draw)) for draw in self.draws]
-        for weight, of_p, p, s in samples:
-            for j in range(J):
-                for a in range(J):
-                    ss[j, a] += weight * np.correlate(s[j], s[a], "full")
-                for i in range(I):
-                    ps[i, j] += of_p * np.correlate(p[i], s[j], "full")
-        return ss, ps
+
+class Window:
+    """An exponential window of the references: its lags, and those of one into which the newest block fades in."""
+
+    def __init__(self, references, lags, g, block):
+        self.g, self.B, self.weight, self.sums = g, block, 0.0, np.zeros((references, references, lags))
+        self.fade_in = 1 - ((np.arange(block) + 0.5) / block) ** 2  # no edge at its end, on which a filter would ring
+
+    def take(self, x):
+        """Take a block, with which x ends."""
+        n, B, f = self.sums.shape[2], self.B, self.g**self.B
+        loud, usual = np.sum(np.mean(x[:, -B:] ** 2, 1)), np.trace(self.sums[:, :, 0])
+        if loud * self.weight > LOUDER * usual:  # a soft past counts less
+            self.weight = usual / loud
+        x = x[:, 1 - n - B :] * self.g ** (np.arange(n + B - 2, -1, -1) / 2)
+        soft = x.copy()
+        soft[:, -B:] *= self.fade_in
+        w = self.g ** np.arange(B - 1, -1, -1)
+        self.lags = (f * self.sums + block_lags(soft[:, -B:], soft, n)) / (
+            f * self.weight + np.sum(w * self.fade_in**2)
+        )
+        self.sums, self.weight = f * self.sums + block_lags(x[:, -B:], x, n), f * self.weight + np.sum(w)
 
 
 @dataclass(kw_only=True)
@@ -251,23 +344,21 @@ class PowerBudget(Controller):
         super().__post_init__()
         (_, J, M), (_, I, L) = self.s_hat.shape, self.w.shape  # noqa: E741
         N, B = L + M - 1, max(round(self.block_s * self.fs), 1)
-        self.B, self.N, self.lags = B, N, L + N
+        self.B, self.N = B, N
         self.g = math.exp(-1 / (min(self.averaging_s / WINDOWS, WINDOW_S) * self.fs))  # of the window of x, a sample
         self.plant = Plant(self.s_hat, I, N, B, self.spread, math.exp(-B / (MEMORY_S * self.fs)))
+        self.window, self.short = Window(I, N, self.g, B), Window(I, N, self.g**SHORTER, B)
         self.blocks = max(round(self.averaging_s * self.fs / B), BLOCK_LASTS)  # over which the power is averaged
-        history = self.lags + B
-        self.x_past, self.y_past = np.zeros((I, history)), np.zeros((J, history))
+        self.x_past, self.y_past = np.zeros((I, N + B)), np.zeros((J, N + B))
         self.new = []  # samples of this block: x, y, e, asked^2, or None while silent
         self.peak = np.zeros(I)  # largest magnitude of x of late
         self.heard = 0  # samples that the delay lines hold, as they were
-        self.R = np.zeros((I, I, self.lags))  # windowed sums of x_i(t) x_i'(t - l)
-        self.short = np.zeros((I, I, L))
-        self.weights = np.zeros(2)
         self.book = np.ones(
             (self.blocks, J)
         )  # power of each block over the rating, newest first; spent before the start
         self.set_room()
         self.price, self.steady_price = np.zeros(J), np.zeros(J)
+        self.now, self.steady = np.zeros((J, I, L)), np.zeros((J, I, L))  # filters at these prices
 
     @property
     def alarms(self):
@@ -316,17 +407,20 @@ class PowerBudget(Controller):
     def end_block(self, x, y, e, asked):
         """Learn from a block: x (I, B), played y (J, B), e (K, B) or None, mean square asked (J,) or None if silent."""
         B = self.B
-        self.x_past = np.concatenate([self.x_past[:, B:], x], axis=1)
-        self.y_past = np.concatenate([self.y_past[:, B:], y], axis=1)
-        self.take_references()
+        self.x_past = np.concatenate([self.x_past[:, B:], x], axis=1)[:, -self.N - B :]
+        self.y_past = np.concatenate([self.y_past[:, B:], y], axis=1)[:, -self.N - B :]
+        self.window.take(self.x_past)
+        self.short.take(self.x_past)
         if asked is not None:
             self.book = np.concatenate([[asked / self.rated_power], self.book[:-1]])
         self.set_room()
-        if e is not None and self.heard >= self.N:
-            self.plant.learn(self.x_past, self.y_past, e)
         self.heard += B
+        rows = self.heard - self.N  # whose delay lines are known; at first, as many as a path has taps
+        if self.plant.T is not None or rows >= self.N:
+            whole = e is not None and (rows >= B or self.plant.T is None)
+            self.plant.learn(self.x_past, self.y_past, e, min(rows, B) if whole else 0)
         if self.plant.silent:
-            self.w[:] = 0.0
+            self.w = np.zeros_like(self.w)
         elif self.plant.fits and not self.plant.waiting:
             self.solve()
 
@@ -335,136 +429,113 @@ class PowerBudget(Controller):
         left = np.maximum(MOST * self.blocks - np.sum(self.book, axis=0), 0.0)
         self.room, self.sum = left * self.B * self.rated_power, np.zeros(len(left))
 
-    def take_references(self):
-        """Add the block to the windows of the references; x is zero before the first, so they are positive definite."""
-        for c, (R, g) in enumerate([(self.R, self.g), (self.short, self.g**SHORTER)]):
-            window = g ** np.arange(self.B - 1, -1, -1.0)
-            R *= g**self.B
-            for i, u in enumerate(self.x_past):
-                for a, v in enumerate(self.x_past):
-                    R[i, a] += lagged(v, window * u[-self.B :], R.shape[2])
-            self.weights[c] = g**self.B * self.weights[c] + np.sum(window)
-
     def solve(self):
-        """Give each loudspeaker in turn the filter of least expected error at its price, given the others'."""
-        (J, I, L), M, N = self.w.shape, self.s_hat.shape[2], self.N  # noqa: E741
-        R = self.R / self.weights[0] * self.g ** (np.arange(self.lags) / 2)
-        R = np.concatenate([np.swapaxes(R, 0, 1)[..., :0:-1], R], axis=2)  # C_xx(l), l from 1 - lags on
-        ss, ps = self.plant.correlations()
-        middle = self.lags - 1
-        # C of x'_ji and x'_j'i' at |l| < L: sum over u of E[s_j ~ s_j'](u) C_xx(l - u), where s_j delays the first signal
-        A = np.empty((J, I, J, I, 2 * L - 1))
-        b = np.zeros((J, I, L))
-        for j in range(J):
-            for i in range(I):
-                for a in range(J):
-                    for c in range(I):
-                        # E[x'_ji(t) x'_ac(t - l)] = sum_u (s_j ~ s_a)(u) C_ic(l - u)
-                        A[j, i, a, c] = np.convolve(R[i, c, middle - L - M + 2 : middle + L + M - 1], ss[j, a], "valid")
-                for c in range(I):
-                    # E[d(t) x'_ji(t - l)] = sum_u (p_c ~ s_j)(u) C_ci(l - u), l from 0 on
-                    b[j, i] += np.convolve(R[c, i, middle - N + 1 : middle + L + M - 1], ps[c, j], "valid")
-        left = 1.0 - np.mean(self.book, axis=0)  # of the account
-        for j in range(J):
-            rest = b[j] - sum(product(A[j, :, a], self.w[a]) for a in range(J) if a != j)
-            self.spend(j, A[j, :, j], rest, R, left[j])
-
-    def spend(self, j, A, b, R, left):
-        """Set the price of loudspeaker j, and its filter at that price."""
-        L, rho = self.w.shape[2], self.rated_power[j]
-        middle = self.lags - 1
-        system = System(A, R[:, :, middle - L + 1 : middle + L], b)
-        # 1 The price at which the filter spends the rating, for the spectrum of the window of x and the level of the
-        # shorter one, which the last filter tells.
-        usual, now = np.sum(self.w[j] * product(system.R, self.w[j])), self.power_of_now(self.w[j])
-        level = now / usual if usual > 0 and now > 0 else 1.0
-        self.steady_price[j], _, _ = system.price_of(rho / level, self.steady_price[j])
+        """Set the prices, and the filters of least expected error at these prices."""
+        J, F = len(self.w), self.plant.F
+        self.set_equations()
+        # 1 The prices at which the filters spend the rating, for the spectrum of the window of x and the level of the
+        # shorter one, which the last filters tell.
+        usual, now = (power_of(self.w, R) for R in (self.R, spectra(self.short.lags, F)))
+        level = np.where((usual > 0) & (now > 0), now / np.where(usual > 0, usual, 1.0), 1.0)
+        for _ in range(PRICE_STEPS):
+            self.steady = self.solved(self.steady_price, self.steady)
+            self.steady_price = self.next_price(self.steady_price, self.steady, self.rated_power / level)
         # 2 What the account holds makes power cheaper, but none that saves little of the noise.
-        price = max(
-            self.steady_price[j] * max(1.0 - CHEAPER * max(left, 0.0), CHEAPEST),
-            WORTHWHILE * np.sum(self.plant.q) / (rho * len(self.rated_power)),
-        )
-        v, power = system.at(price)
+        left = np.maximum(1.0 - np.mean(self.book, axis=0), 0.0)
+        floor = WORTHWHILE * np.sum(self.plant.q) / (self.rated_power * J)
+        self.price = np.maximum(self.steady_price * np.maximum(1.0 - CHEAPER * left, CHEAPEST), floor)
+        self.now = self.solved(self.price, self.now)
         # 3 The account must stand it, and for longer if a silence has left more than the price follows.
-        saved = CHEAPER * left > 1.0 - CHEAPEST
-        share = self.share(j, v, power, min(level, 1.0) * power if saved else None) if power > 0 else 1.0
-        if share < 1.0:
-            price, v, _ = system.price_of(share * power, price)
-        self.price[j], self.w[j] = price, v
+        later = np.where(CHEAPER * left > 1.0 - CHEAPEST, np.minimum(level, 1.0), 0.0)
+        share, power = self.share(self.now, later), power_of(self.now, self.R)
+        if np.any(share < 1.0):
+            self.price = self.next_price(self.price, self.now, np.minimum(share, 1.0) * power)
+            self.now = self.solved(self.price, self.now)
+            share = self.share(self.now, later)
+        self.w = self.now * np.sqrt(np.minimum(share, 1.0))[:, None, None]
 
-    def power_of_now(self, v):
-        """Return the mean power of a filter v, (I, L), over the short window."""
-        I, L = v.shape  # noqa: E741
-        C = self.short / self.weights[1] * self.g ** (SHORTER / 2 * np.arange(L))
-        # E[y^2] = sum_l (v_i ~ v_a)(l) C_ia(l), with both signs of l in the two orders of i and a
-        h = [[np.correlate(v[a], v[i], "full")[L - 1 :] for a in range(I)] for i in range(I)]  # sum_m v_a(m + l) v_i(m)
-        return sum(2 * h[i][a] @ C[i, a] - h[i][a][0] * C[i, a, 0] for i in range(I) for a in range(I))
+    def set_equations(self):
+        """Set A = SS R and b: correlations of the filtered references, and with the disturbance, over the posterior."""
+        F, L, p = self.plant.F, self.w.shape[2], self.plant
+        lags = self.window.lags.copy()
+        lags[range(len(lags)), range(len(lags)), 0] *= 1 + REGULAR
+        self.R = spectra(lags, F)
+        self.smooth_R = smoothed(self.R, L)
+        P, S = (np.fft.rfft(rows, F) for rows in p.paths())
+        self.SS = np.einsum("kjf,kaf->jaf", S.conj(), S)
+        K = len(p.q)
+        PS = p.significant * np.einsum("kcf,kjf->jcf", P[:K], S[:K].conj())
+        PS = PS + p.significant * np.einsum("kcf,kjf->jcf", P[K:], S[K:].conj())
+        self.b = np.fft.irfft(np.einsum("jcf,icf->jif", PS, self.R), F)[..., :L]
+        (J, I, _), bins = self.w.shape, F // 2 + 1  # noqa: E741
+        A = np.einsum("jaf,icf->jiacf", self.SS, self.R).reshape(J * I, J * I, bins)
+        self.smooth_A = smoothed(A, L).reshape(J, I, J, I, bins)
+        self.gain = np.array([np.fft.irfft(self.SS[j, j], F)[0] for j in range(J)])
 
-    def share(self, j, v, power, now):
-        """Return the largest share of its power that the account of loudspeaker j stands, for a filter v, (I, L).
+    def solved(self, price, v):
+        """Return filters after some steps from v towards those at the prices."""
+        (J, I, L), F = v.shape, self.plant.F  # noqa: E741
+        price = price + REGULAR * self.gain
+        SS = self.SS + np.diag(price)[:, :, None]
+        A = self.smooth_A + np.einsum("ja,icf->jiacf", np.diag(price), self.smooth_R)
+        self.inverse = inverted(A.reshape(J * I, J * I, -1)).reshape(A.shape)
 
-        It must stand the power of the last block for T/20, that of the window of x for T/4, and that of now, if given, for
-        any time from there to 3T/4: so what a silence has left is spent evenly.
+        def product(u):
+            return np.fft.irfft(np.einsum("jaf,icf,acf->jif", SS, self.R, np.fft.rfft(u, F), optimize=True), F)[..., :L]
+
+        def precondition(u):
+            return np.fft.irfft(np.einsum("jiacf,acf->jif", self.inverse, np.fft.rfft(u, F)), F)[..., :L]
+
+        return conjugate_gradients(product, precondition, self.b, v, FILTER_STEPS, (0, 1, 2))[0]
+
+    def next_price(self, price, v, target):
+        """Return prices after a step of Newton's method for the powers, of which power^-1/2 is nearly a line.
+
+        The slopes are -2 u_i' A^-1 u_j, u_j = R v_j; the preconditioner stands for A^-1.
         """
-        T, rho, window = self.blocks, self.rated_power[j], self.blocks // WINDOW_LASTS
-        spent = np.concatenate([[0.0], np.cumsum(self.book[:, j])])
-        y = sum(filtered(h, u, self.B) for h, u in zip(v, self.x_past, strict=True))
-        expected = [(power, window), (np.mean(y**2), T // BLOCK_LASTS)]  # power, for how many blocks
-        if now is not None:
-            expected += [(now, n) for n in range(window + 1, T - window + 1)]
-        return min(max(T - spent[T - n], 0.02 * n) / n * rho / max(power, 1e-300) for power, n in expected)
+        F = self.plant.F
+        u = np.fft.irfft(np.einsum("icf,jcf->jif", self.R, np.fft.rfft(v, F)), F)[..., : v.shape[2]]
+        power, U = np.sum(v * u, axis=(1, 2)), np.fft.rfft(u, F)
+        weight = np.r_[1.0, np.full(F // 2 - 1, 2.0), 1.0] / F
+        H = np.einsum("f,jif,jiacf,acf->ja", weight, U.conj(), self.inverse, U, optimize=True).real
+        free = (price > 0) | (power > target)
+        H = np.where(np.outer(free, free), H, 0.0)
+        size = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+        H = H * np.outer(size, size)
 
+        def step_of(r):
+            return (
+                size
+                * np.linalg.solve(H + (REGULAR * free + ~free) * np.eye(len(H)), np.where(free, size * r, 0.0))
+                * free
+            )
 
-def product(A, v):
-    """Return sum_c A_ic v_c, (I, L), for Toeplitz blocks A_ic[l, m] = A[i, c, L - 1 + m - l]."""
-    return np.array([sum(np.correlate(lags, h, "valid")[::-1] for lags, h in zip(row, v, strict=True)) for row in A])
+        step = step_of(power * (np.sqrt(power / target) - 1))
+        if not step @ (power - target) > 0:
+            step = step_of(0.5 * (power - target))
+        price = price + np.clip(step, -price, np.maximum(PRICE_RISES * price, 1e-3 * self.gain))
+        return np.where(price < 1e-9 * self.gain, 0.0, price)
 
+    def share(self, v, later):
+        """Return the largest shares of their power that the accounts stand.
 
-class System:
-    """(A + price R) v = b with Toeplitz blocks, and the power v' R v."""
-
-    def __init__(self, A, R, b):
-        L = b.shape[1]
-        self.A, self.R, self.b = A.copy(), R, b
-        self.A[range(len(b)), range(len(b)), L - 1] *= 1 + 1e-7
-        self.scale = A[0, 0, L - 1] / R[0, 0, L - 1]
-
-    def solved(self, price, *right):
-        """Return the solutions for right sides, (I, L); LinAlgError if the matrix is not positive definite."""
-        lags = self.A + price * self.R
-        I, L = self.b.shape  # noqa: E741
-        if I == 1:
-            v = solve_toeplitz(lags[0, 0, L - 1 :], np.transpose([u[0] for u in right]), check_finite=False)
-            return [u[np.newaxis] for u in v.T]
-        whole = np.block([[toeplitz(lags[i, c, L - 1 :: -1], lags[i, c, L - 1 :]) for c in range(I)] for i in range(I)])
-        v = cho_solve(cho_factor(whole, lower=True), np.transpose([u.ravel() for u in right]))
-        return [u.reshape(I, L) for u in v.T]
-
-    def at(self, price):
-        """Return v and its power; zeros if there is no solution."""
-        try:
-            (v,) = self.solved(price, self.b)
-        except LinAlgError:
-            return np.zeros_like(self.b), 0.0
-        return v, float(np.sum(v * product(self.R, v)))
-
-    def price_of(self, power, start):
-        """Return the least price >= 0 at which v takes at most `power`, v, and the power that it takes.
-
-        power^-1/2 is a concave function of the price, nearly a line, so Newton's steps approach from below.
+        They must stand the power of the last block for T/20, that of the window of x for T/4, and `later` times it, for any
+        longer time: so what a silence has left is spent evenly.
         """
-        price = start if start < 1e6 * self.scale else 0.0
-        for _ in range(20):
-            try:
-                (v,) = self.solved(price, self.b)
-                u = product(self.R, v)
-                (w,) = self.solved(price, u)
-            except LinAlgError:
-                price = max(2 * price, 1e-6 * self.scale)
-                continue
-            taken, slope = np.sum(v * u), np.sum(u * w)
-            if abs(taken - power) <= 0.005 * power or (price == 0.0 and taken <= power) or not slope > 0:
-                break
-            # power^-1/2 has the slope taken^-3/2 u' A^-1 u
-            price = max(price + taken * (math.sqrt(taken / power) - 1.0) / slope, 0.0)
-        return price, v, float(taken)
+        T, window, power = self.blocks, self.blocks // WINDOW_LASTS, power_of(v, self.R)
+        spent = np.concatenate([np.zeros((1, len(v))), np.cumsum(self.book, axis=0)])
+        of_block = np.array([np.mean(filtered(h, self.x_past, self.B) ** 2) for h in v])
+        expected = [(power, window), (of_block, T // BLOCK_LASTS)]  # power, for how many blocks
+        expected += [(later * power, n) for n in range(window + 1, T - T // BLOCK_LASTS + 1)]
+        stood = [
+            np.maximum(PLANNED * T - spent[T - n], LEAST_SHARE * n) / n * self.rated_power / np.maximum(P, 1e-300)
+            for P, n in expected
+        ]
+        return np.min(stood, axis=0)
+
+
+def power_of(v, R):
+    """Return the powers of filters (J, I, L) for the spectra of the lags of x."""
+    F = 2 * (R.shape[2] - 1)
+    u = np.fft.irfft(np.einsum("icf,jcf->jif", R, np.fft.rfft(v, F)), F)[..., : v.shape[2]]
+    return np.sum(v * u, axis=(1, 2))

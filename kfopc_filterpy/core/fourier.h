@@ -1,0 +1,61 @@
+/* Fourier transforms of real numbers, and what can be done with them: sums of products at all lags,
+ * and systems of Toeplitz equations whose lags are of both signs. F, a power of two, holds 2N of
+ * them. A spectrum is F / 2 + 1 real parts, and after them as many imaginary ones. */
+#ifndef FOURIER_H
+#define FOURIER_H
+#include "signals.h"
+
+typedef struct {
+    int32_t F, half, bins; /* F / 2, F / 2 + 1 */
+    int32_t spectrum;      /* reals of one */
+    real *turns;           /* (2, F) cosines and sines of pi p / m at m + p */
+    real *work;            /* (5, F + 2) of a transform, and of sums at lags */
+} fourier;
+
+/* Lay out transforms for the lags of N taps. */
+void layout_fourier(fourier *f, int32_t N, anc_layout *at);
+void start_fourier(const fourier *f);
+/* Transform n <= F numbers, with zeros after them. */
+void transform(const fourier *f, real *spectrum, const real *from, int32_t n);
+/* Set F numbers to those of a spectrum. */
+void transform_back(const fourier *f, real *to, const real *spectrum);
+/* Add sum_k u(k) v(k + l), k < n, to to_l, l < lags; lags <= F / 2. */
+void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *v, int32_t lags);
+/* Set a spectrum to that of ahead_l at lags l and behind_l at lags -l, l < n, under a triangle that
+ * ends at lag n if `smooth`: then Toeplitz matrices that are definite become circulants that are.
+ * The matrix nearest to a Toeplitz one: T. Chan, SIAM J. Sci. Stat. Comput. 9 (1988) 766. */
+void transform_lags(const fourier *f, real *spectrum, const real *ahead, const real *behind,
+                    int32_t n, int smooth);
+
+/* Matrices of n by n spectra, one row after the other. */
+
+/* Add the product of two spectra, times a sign; a is conjugate if `turn` is -1. */
+static inline void add_product(const fourier *f, real *restrict to, const real *restrict a,
+                               const real *restrict b, const real sign, const real turn)
+{
+    const int32_t n = f->bins;
+    for (int32_t k = 0; k < n; k++) {
+        to[k] += sign * (a[k] * b[k] - turn * a[n + k] * b[n + k]);
+        to[n + k] += sign * (a[k] * b[n + k] + turn * a[n + k] * b[k]);
+    }
+}
+
+/* Factorise the lower triangle of a Hermitian matrix in place, at each frequency; the diagonal
+ * becomes 1 / the factor's. Where it is singular, but for rounding, that is 0. */
+void factorise_spectra(const fourier *f, real *A, int32_t n);
+/* Solve for the right side x, n spectra, in place. */
+void solve_spectra(const fourier *f, const real *factor, real *x, int32_t n);
+
+/* Equations A v = b of n numbers, and approximate ones that are solved at once. */
+typedef struct {
+    void *self;
+    void (*multiply)(void *self, real *to, const real *v);     /* to = A v */
+    void (*precondition)(void *self, real *to, const real *r); /* to = about A^-1 r */
+    int32_t n;
+    real *work; /* (4, n); then the first n are b - A v */
+} equations;
+
+/* Take steps of conjugate gradients from v on, until what is missing, v' A v, is not more than
+ * `enough`, about. */
+void approach(const equations *of, const real *b, real *v, int steps, real enough);
+#endif
