@@ -19,7 +19,7 @@ from .timing import Work
 
 R, Q, P0 = 1e-8, 1.0, 1e-3
 SHARING = 64
-WHOLE_RUN_S = 20.0  # of KF-PB, which factorises its posterior again and again as long as it runs
+WHOLE_RUN_S = 20.0  # of KF-PB, whose steps after a block become fewer as it learns
 PLANT = Plant(np.random.default_rng(0).standard_normal(32) / 8, fs=16000)  # of the closed loops
 TARGET_FLOPS = 1e8  # of a turn
 TAPS = (16, 64, 128, 256, 512, 1024)
@@ -44,7 +44,7 @@ def _kalman(make: Any, taps: int, **settings: Any) -> Any:
     return make(taps, PLANT, state_noise=R, measurement_noise=Q, initial_variance=P0, **settings)
 
 
-# KF-PB has so low a rated power that the price is always searched for.
+# KF-PB has so low a rated power that power always has a price.
 CONTROLLERS: dict[str, Callable[[int], Any]] = {
     "KF-ANC": lambda taps: _kalman(kf_anc, taps),
     "KF-OPC": lambda taps: _kalman(kf_opc, taps, rated_power=0.1),

@@ -145,8 +145,8 @@ def kf_pb(
 
     Both paths are verified while they are used. If the errors contradict the posterior, the plant has changed, and all
     that was learned is forgotten. If the control then does more harm than good, the loudspeakers are silent for a block
-    or two, until both paths are learned again. If a new `secondary` is assigned, the posterior begins
-    anew, too. The account stays, and the control filter stays until the first solution.
+    or two, until both paths are learned again. If a new `secondary` is assigned, the posterior begins anew, too. The
+    account stays, and the control filter stays until the first solution.
 
     Parameters
     ----------
