@@ -622,7 +622,8 @@ static int note(budget *f, const real *error, int controlled)
         if (controlled) f->asked[s->J + j] += f->asked[j] * f->asked[j];
     }
     *f->controlled |= controlled;
-    if (complete_sample(p, error)) end_block(f);
+    complete_sample(p, error);
+    if (p->heard[FILLED] == p->B) end_block(f);
     return ANC_DONE;
 }
 

@@ -379,13 +379,13 @@ static int approach_posterior(posterior *f)
 
 /* A block. */
 
-int complete_sample(posterior *f, const real *error)
+void complete_sample(posterior *f, const real *error)
 {
     const int32_t at = f->B - 1 - f->heard[FILLED];
     for (int32_t k = 0; error && k < f->K; k++) f->errors[times(k, f->B) + (size_t)at] = error[k];
     f->heard[MISSING] |= !error;
     f->heard[AWAITED] = 0;
-    return ++f->heard[FILLED] == f->B;
+    f->heard[FILLED]++;
 }
 
 void begin_block(posterior *f)
@@ -666,10 +666,11 @@ void learn(posterior *f, real forget)
 {
     if (f->heard[HEARD] < 1 << 30) f->heard[HEARD] += f->B;
     /* Rows whose delay lines are known; at first, as many as a path has taps. */
-    const int32_t rows = f->heard[HEARD] - f->N, begun = f->counts[BEGUN];
-    if (!begun && rows < f->N) return;
-    const int whole = !f->heard[MISSING] && (rows >= f->B || !begun);
-    learn_samples(f, !whole ? 0 : rows < f->B ? rows : f->B, forget);
+    const int32_t rows = f->heard[HEARD] - f->N, least = f->counts[BEGUN] ? f->B : f->N;
+    int32_t newest = 0;
+    if (!f->counts[BEGUN] && rows < least) return;
+    if (!f->heard[MISSING] && rows >= least) newest = rows < f->B ? rows : f->B;
+    learn_samples(f, newest, forget);
 }
 
 void secondary_of(const posterior *f, int32_t row, int32_t j, real *to)
