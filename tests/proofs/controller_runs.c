@@ -4,7 +4,12 @@
 #include "any.h"
 #include "shape.h" /* ALGORITHM and its SETTINGS, and how many there are of what a plan has */
 
-enum { MOST = 32768, REFERENCES = CHANNELS * (1 + MODELLED), ALL = SCENARIOS * CHANNELS };
+enum {
+    MOST = 32768,
+    MODELS = MODELLED * MICROPHONES, /* references of an internal model */
+    ALL_OUT = SCENARIOS * LOUDSPEAKERS,
+    ALL_HEARD = SCENARIOS * MICROPHONES
+};
 static double block[MOST];
 static anc_view view;
 
@@ -15,15 +20,18 @@ static void any_numbers(anc_real *to, int n)
 
 int main(void)
 {
-    static const int32_t windows[ALL] = {WINDOW}, limiters[] = {LIMITER, LIMITER, LIMITER, LIMITER};
-    static const anc_real path[TAPS * CHANNELS * CHANNELS] = {0.5, 0.25}, guard[GUARD] = {0.1};
-    static const anc_real settings[] = {SETTINGS};
+    static const int32_t windows[ALL_OUT] = {WINDOW};
+    static const int32_t limiters[] = {LIMITER, LIMITER, LIMITER, LIMITER};
+    const anc_real settings[] = {SETTINGS};
+    anc_real path[PATH_TAPS * MICROPHONES * LOUDSPEAKERS], guard[GUARD + 1];
+    any_numbers(path, PATH_TAPS * MICROPHONES * LOUDSPEAKERS);
+    any_numbers(guard, GUARD);
     const anc_plan plan = {.scenarios = SCENARIOS,
-                           .microphones = CHANNELS,
-                           .loudspeakers = CHANNELS,
-                           .references = REFERENCES,
+                           .microphones = MICROPHONES,
+                           .loudspeakers = LOUDSPEAKERS,
+                           .references = REFERENCES + MODELS,
                            .taps = TAPS,
-                           .path_taps = TAPS,
+                           .path_taps = PATH_TAPS,
                            .guard_taps = GUARD,
                            .modelled = MODELLED,
                            .power_windows = windows,
@@ -34,9 +42,9 @@ int main(void)
     if (!anc_open(&ALGORITHM, &plan, &view, block, sizeof block, 1)) return 1;
     ((signals *)&view)->amplifier[0] = (anc_amplifier){ANC_SOFT_SATURATION, 1, 2};
     for (;;) {
-        anc_real x[CHANNELS], e[ALL], y[ALL];
-        any_numbers(x, CHANNELS);
-        any_numbers(e, ALL);
+        anc_real x[REFERENCES], e[ALL_HEARD], y[ALL_OUT];
+        any_numbers(x, REFERENCES);
+        any_numbers(e, ALL_HEARD);
         if (Frama_C_interval(0, 1)) {
             const uint8_t adapt = Frama_C_interval(0, 1);
             int32_t answer;
