@@ -43,6 +43,11 @@ COVARIANCE = {
     "largest_variance": 100,
     "row_of": 10,
 }
+BUDGET = {
+    "start_fourier": 1000,
+    **dict.fromkeys(("transform_complex", "set_right", "set_theta"), 100),
+    **dict.fromkeys(("add_lags", "dot", "explain", "after_change"), 30),
+}
 ANY_ANSWER = (  # of the processor, of which Eva knows nothing
     (
         "processor.c",
@@ -268,10 +273,42 @@ CONTROLLERS = {  # their name in C, and their file
     "diagonal KF": ("diagonal", "diagonal.c"),
     "signals alone": ("signals_alone",),
 }
+# What Eva must analyse to the last statement: a block's end, a fit, a surprise and the silence after it, clicks.
+LEARNING = (
+    *("control_signal_budget", "cut_clicks", "note", "end_block", "learn", "notice_surprise", "after_change"),
+    *("begin_block", "approach", "solve_all", "next_prices", "affordable"),
+)
+# A block of 13 samples and 16 numbers in a transform have every way to sum, and to step through a transform.
+BUDGETS: dict[str, dict[str, Any]] = {
+    "2 microphones, 2 loudspeakers, 1 reference, 4 and 2 taps, blocks of 13": SHAPE
+    | {"references": 1, "taps": 4, "path_taps": 2, "guard": 0}
+    | {"settings": "any(), any(), 13, 20, any(), any(), Frama_C_double_interval(5e-324, 1000)"}
+    | {"reached": (*LEARNING, "approach_posterior", "begin_data", "add_samples", "hear_row", "make_step")},
+    "exact path, internal model, 1 channel, 3 and 3 taps, blocks of 6": SHAPE
+    | {"microphones": 1, "loudspeakers": 1, "references": 1, "modelled": 1, "guard": 0}
+    | {"settings": "any(), 6, 20, any(), any(), 0"}
+    | {"reached": LEARNING},
+}
+EXACT = BUDGETS["exact path, internal model, 1 channel, 3 and 3 taps, blocks of 6"]
 KALMAN_FAULTS = {  # a file, what is right in it, and what is not
     "a row too far": ("covariance.c", "row += 2 * length;", "row += 2 * length + PARTS;"),
     "a row too many": ("covariance.c", "c->padded = groups * PARTS;", "c->padded = groups * PARTS + 1;"),
     "a delay line that ends late": ("signals.c", "*l->at = l->length - l->taps;", "*l->at = l->length - l->taps + 1;"),
+}
+BUDGET_FAULTS = {
+    "a spectrum too long": ("fourier.c", "im[0] = im[H] = 0;", "im[0] = im[H + 1] = 0;"),
+    "a sample too many transformed": ("fourier.c", "2 * k + 1 < n ?", "2 * k < n ?"),
+    "a lag too many": ("fourier.c", "l < lags; l++) to[l] +=", "l <= lags; l++) to[l] +="),
+    "a history moved too far": ("posterior.c", "(size_t)(f->history - f->B));", "(size_t)(f->history - f->B + 1));"),
+    "an error too late": ("posterior.c", "at = f->B - 1 - f->heard[FILLED]", "at = f->B - f->heard[FILLED]"),
+    "a change found too late": ("posterior.c", "f->B * i / EIGHTHS;", "f->B * i / EIGHTHS + 2;"),
+    "a block too long": ("budget.c", "if (p->heard[FILLED] == p->B)", "if (p->heard[FILLED] > p->B)"),
+    "a book moved too far": ("budget.c", "times(f->T - 1, J)", "times(f->T, J)"),
+    "a weight too many silenced": (
+        "budget.c",
+        "clear(f->s.weights, times(f->s.J * f->s.I, f->s.L));",
+        "clear(f->s.weights, times(f->s.J * f->s.I, f->s.L + 1));",
+    ),
 }
 TO_AN_ALARM = ("-eva-stop-at-nth-alarm", 1)
 
@@ -279,6 +316,11 @@ TO_AN_ALARM = ("-eva-stop-at-nth-alarm", 1)
 def kalman(**given: Any) -> Callable[[], list[str]]:
     """Return a job: the Kalman filter."""
     return controller("kalman", "kalman.c", "covariance.c", exactly=COVARIANCE, **given)
+
+
+def power_budget(**given: Any) -> Callable[[], list[str]]:
+    """Return a job: KF-PB."""
+    return controller("power_budget", "fourier.c", "posterior.c", "budget.c", exactly=BUDGET, **given)
 
 
 def noticed(job: Callable[[], list[str]]) -> Callable[[], list[str]]:
@@ -315,9 +357,14 @@ JOBS: dict[str, Callable[[], list[str]]] = {
         for words, shape in SHAPES.items()
     },
     **{f"Kalman filter, {words}, for ever": kalman(**shape) for words, shape in SHAPES.items()},
+    **{f"KF-PB, {words}, for ever": power_budget(**given) for words, given in BUDGETS.items()},
     **{
         f"fault of memory, {name}": noticed(kalman(changes=(fault,), options=TO_AN_ALARM, **SHAPES["internal model"]))
         for name, fault in KALMAN_FAULTS.items()
+    },
+    **{
+        f"fault of memory, {name}": noticed(power_budget(changes=(fault,), options=TO_AN_ALARM, **EXACT))
+        for name, fault in BUDGET_FAULTS.items()
     },
 }
 
