@@ -276,7 +276,7 @@ CONTROLLERS = {  # their name in C, and their file
 # What Eva must analyse to the last statement: a block's end, a fit, a surprise and the silence after it, clicks.
 LEARNING = (
     *("control_signal_budget", "cut_clicks", "note", "end_block", "learn", "notice_surprise", "after_change"),
-    *("begin_block", "approach", "solve_all", "next_prices", "affordable"),
+    *("begin_block", "approach", "solve_all", "next_prices"),
 )
 # A block of 13 samples and 16 numbers in a transform have every way to sum, and to step through a transform.
 BUDGETS: dict[str, dict[str, Any]] = {
