@@ -490,18 +490,21 @@ static real power_of_block(const budget *f, const real *v)
 }
 
 /* Return the largest factor on the power of filter v that loudspeaker j's account can afford, if
- * its noise goes on for a time: that of the last block; for longer, that of the window of x, for
- * which v takes `power`; and `later` times that for any longer time, if this is not 0. */
+ * the noise goes on: that of the last block for a short time, and that of the window of x, for
+ * which v takes `power`, for longer. If `later` is not 0, the rating must last for `later` times
+ * this power for even longer: otherwise what a silence has saved would be spent at once, and be
+ * missing later. */
 static real affordable(const budget *f, int32_t j, const real *v, real power, real later)
 {
     const int32_t T = f->T, block = T / BLOCK_LASTS, window = T / WINDOW_LASTS;
     const real rated = f->s.setting[RATED_POWER][j], of_block = power_of_block(f, v);
     real spent = 0, factor = 0;
-    for (int32_t n = T - 1; n >= block; n--) { /* spent: and in the account after n blocks, too */
+    for (int32_t n = T - 1; n >= block; n--) { /* spent, and still counted n blocks from now */
         spent += f->book[times(T - 1 - n, f->s.J) + (size_t)j];
         const int longer = later > 0 && n > window && n <= T - block;
         if (!longer && n != window && n != block) continue;
-        const real left = larger(PLANNED * (real)T - spent, LEAST_SHARE * (real)n);
+        const real planned = (longer ? 1 : PLANNED) * (real)T;
+        const real left = larger(planned - spent, LEAST_SHARE * (real)n);
         const real expected = longer ? later * power : n == window ? power : of_block;
         const real afforded = left / (real)n * rated / larger(expected, LEAST_POWER);
         if (factor == 0 || afforded < factor) factor = afforded;

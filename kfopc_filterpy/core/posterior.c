@@ -17,7 +17,7 @@ enum { EIGHTHS = 8 };
 /* At most so many steps of conjugate gradients in a block, until what is missing is this share of
  * the doubt. */
 enum { PLANT_STEPS = 8 };
-static const real ENOUGH = (real)0.01;
+static const real ENOUGH = (real)0.001;
 
 /* Correlations. Every sum is in the order of k, whatever the number of sums that are formed at
  * once. */
