@@ -49,27 +49,27 @@ def run(case: study.Rated, **settings: float) -> tuple[np.ndarray, np.ndarray]:
         sounds = a >= on
         if sounds:
             past = np.concatenate([own.x_past[0], x[a:b]])
-            y[taps + a : taps + b] = law.filtered(own.w[0, 0], past, B)
-            e[a:b] -= law.filtered(case.secondary, y[: taps + b], B)
-        spent = np.array([np.mean(y[taps + a : taps + b] ** 2)]) if sounds else None
-        own.end_block(x[np.newaxis, a:b], y[np.newaxis, taps + a : taps + b], e[np.newaxis, a:b], spent)
+            y[taps + a : taps + b] = np.convolve(past, own.w[0, 0])[: past.size][-B:]
+            e[a:b] -= np.convolve(y[a + 1 : taps + b], case.secondary, "valid")
+            own.asked = list(y[taps + a : taps + b, np.newaxis] ** 2)
+        own.end_block(x[np.newaxis, a:b], y[np.newaxis, taps + a : taps + b], e[np.newaxis, a:b])
     return e[on:], y[taps + on :]
 
 
 @contextmanager
 def without(rule: str) -> Iterator[dict[str, float]]:
     """Switch a rule off; the settings of the controller that this takes."""
-    kept = {name: getattr(law, name) for name in ("CHEAPER", "WINDOW_S", "WINDOWS", "WORTHWHILE", "SHORTER")}
-    share = law.PowerBudget.share
+    kept, share = vars(law.core).copy(), law.PowerBudget.share
+    windows = law.WINDOW_S, law.WINDOWS
     settings = {"spread": 0.0}
     if rule == "account":
-        law.CHEAPER = 0.0
+        law.core.CHEAPER = 0.0
     elif rule == "floor":
-        law.WORTHWHILE = 0.0
+        law.core.WORTHWHILE = 0.0
     elif rule == "the shorter window":
         law.WINDOW_S, law.WINDOWS = 10.0, 1
     elif rule == "the level":
-        law.SHORTER = 1
+        law.core.SHORTER = 1
     elif rule == "what the account stands":
         law.PowerBudget.share = lambda self, v, _: np.ones(len(v))
     elif rule == "with the path verified":
@@ -78,8 +78,8 @@ def without(rule: str) -> Iterator[dict[str, float]]:
         yield settings
     finally:
         law.PowerBudget.share = share
-        for name, value in kept.items():
-            setattr(law, name, value)
+        law.WINDOW_S, law.WINDOWS = windows
+        vars(law.core).update(kept)
 
 
 def main() -> None:
