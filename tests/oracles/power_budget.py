@@ -419,11 +419,12 @@ class PowerBudget(Controller):
         T, window, block = self.blocks, self.blocks // core.WINDOW_LASTS, self.blocks // core.BLOCK_LASTS
         spent = np.concatenate([np.zeros((1, len(v))), np.cumsum(self.book, axis=0)])
         X, power = regressors(self.x_past, self.w.shape[2])[-self.B :], power_of(v, self.R)
-        expected = [(power, window), (np.mean((X @ v.T) ** 2, axis=0), block)]  # power, for how many blocks
-        expected += [(later * power, n) for n in range(window + 1, T - block + 1)]
+        planned = core.PLANNED * T
+        expected = [(power, window, planned), (np.mean((X @ v.T) ** 2, axis=0), block, planned)]  # for so many blocks
+        expected += [(later * power, n, T) for n in range(window + 1, T - block + 1)]
         shares = []
-        for P, n in expected:
-            left = np.maximum(core.PLANNED * T - spent[T - n], core.LEAST_SHARE * n) / n * self.rated_power
+        for P, n, all_of_it in expected:
+            left = np.maximum(all_of_it - spent[T - n], core.LEAST_SHARE * n) / n * self.rated_power
             shares.append(left / np.maximum(P, 1e-300))
         return np.min(shares, axis=0)
 
