@@ -16,7 +16,7 @@ from .library import Field, Library, at_cache_line, constant, fields_of, load
 
 _STATE, _SETTING, _SCRATCH = range(3)
 _PRECISIONS: dict[str, np.dtype[Any]] = {"double": np.dtype(np.float64), "float": np.dtype(np.float32)}
-_VIEW_PLACES = 128  # of `anc_view` in anc.h
+_VIEW_PLACES = 136  # of `anc_view` in anc.h
 SLACK = 64  # of delay lines, see signals.c
 _EACH = ("", "loudspeakers", "microphones")
 _step = ctypes.PYFUNCTYPE  # keeps the interpreter's lock

@@ -56,7 +56,7 @@ class CExport:
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     exported = export_c(controller, Path(folder) / "anc.c", dtype="float32")
     >>> exported
-    <CExport anc.c: FxLMS, 16 taps, float32, state of 4,112 bytes>
+    <CExport anc.c: FxLMS, 16 taps, float32, state of 4,176 bytes>
     """
 
     path: Path
