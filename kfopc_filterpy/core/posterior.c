@@ -369,6 +369,10 @@ static int approach_posterior(posterior *f)
         if (row < f->K) f->next_q[row] = noise_of(f, row, q, f->vectors);
     }
     copy(f->q, f->next_q, (size_t)f->K);
+    /* Draws are over sqrt(q). If q rises, they keep their size, until they are solved with it. */
+    const real scale = smaller(root(q / mean_noise(f)), 1);
+    real *draws = taps_of(f, f->solution, f->K, 0);
+    for (int32_t i = 0; scale < 1 && i < (f->rows - f->K) * all; i++) draws[i] *= scale;
     keep_significant(f);
     set_theta(f);
     count_up(f->fits);
@@ -630,16 +634,15 @@ static int32_t notice_surprise(posterior *f, const judgement *is, int32_t newest
     return newest;
 }
 
-/* Return whether the block has more energy of x than the data: what it is expected to be would then
- * be more than what is known. */
+/* Return whether a block has more energy than the data, of the references or of what is played. */
 static int outweighs_data(const posterior *f)
 {
-    real block = 0, data = 0;
-    for (int32_t i = 0; i < f->I; i++) {
-        block += dot(history_of(f, i), history_of(f, i), f->B);
-        data += f->T[times(i * f->C + i, f->N)];
+    real block[2] = {0, 0}, data[2] = {0, 0};
+    for (int32_t c = 0; c < f->C; c++) {
+        block[c >= f->I] += dot(history_of(f, c), history_of(f, c), f->B);
+        data[c >= f->I] += f->T[times(c * f->C + c, f->N)];
     }
-    return block >= data || !(f->numbers->samples > 0);
+    return block[0] >= data[0] || block[1] > data[1] || !(f->numbers->samples > 0);
 }
 
 /* Learn from the newest samples of a block; 0: its errors are not known. */

@@ -99,9 +99,10 @@ def compare(
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=RATE * scale)
     np.testing.assert_allclose(controller.power_weight, oracle.price, rtol=RATE, atol=RATE * np.max(oracle.price))
     np.testing.assert_allclose(controller.measurement_noise, oracle.plant.q, rtol=1e-5)
-    for got, expected in ((controller.primary_path, oracle.plant.p), (controller.identified_path, oracle.plant.s)):
+    p, s = (paths[: oracle.plant.K] for paths in oracle.plant.paths())
+    for got, expected in ((controller.primary_path, p), (controller.identified_path, s)):
         np.testing.assert_allclose(
-            np.reshape(got, expected.shape), expected, rtol=1e-5, atol=RATE * np.max(np.abs(oracle.plant.theta))
+            np.reshape(got, expected.shape), expected, rtol=1e-5, atol=RATE * np.max(np.abs(expected))
         )
     assert controller.alarms == oracle.plant.surprises
 

@@ -1,6 +1,6 @@
 """Print what each rule of KF-PB's price is worth, with the oracle: ``python tests/helpers/budget_ablation.py``.
 
-It takes about a quarter of an hour.
+It takes about an hour.
 """
 
 from __future__ import annotations

@@ -20,7 +20,14 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from oracles.signals import Controller
 
-from kfopc_filterpy.controllers.kf_pb import MEMORY_S, WINDOW_S, WINDOWS
+from kfopc_filterpy.controllers.kf_pb import (
+    BLOCK_S,
+    DEFAULT_AVERAGING_S,
+    DEFAULT_UNCERTAINTY,
+    MEMORY_S,
+    WINDOW_S,
+    WINDOWS,
+)
 from kfopc_filterpy.core.building import FOLDER
 
 
@@ -113,16 +120,6 @@ class Plant:
         return signs
 
     @property
-    def p(self):
-        """Return the primary paths, (K, I, N), as far as they are significant."""
-        return self.significant * self.theta[: self.K, : self.split].reshape(self.K, -1, self.N)
-
-    @property
-    def s(self):
-        """Return the secondary paths, (K, J, M)."""
-        return self.theta[: self.K, self.split :].reshape(self.K, -1, self.N)[..., : self.M]
-
-    @property
     def T(self):
         """Return the sums of lags of faded signals, z(t) g^(age/2), (C, C, N): all since the begin, and before it."""
         taper = self.g ** (np.arange(self.N) / 2)
@@ -158,8 +155,9 @@ class Plant:
         if new and known and (self.exact or not played or self.taught > 0):
             missed = np.mean((e - self.theta[:K] @ Z.T) ** 2, axis=0)
             new = self.judge(missed, np.mean(d**2, axis=0), heard, z, Z)
-        of_block, of_data = np.sum(z[:I, -self.B :] ** 2), self.energy_of(slice(I))
-        if not new and not self.waiting and (self.count == 0 or of_block >= of_data):
+        x2, y2 = (np.sum(z[part, -self.B :] ** 2) for part in (slice(I), slice(I, None)))
+        outweighs = self.count == 0 or x2 >= self.energy_of(slice(I)) or y2 > self.energy_of(slice(I, None))
+        if not new and not self.waiting and outweighs:
             self.begin(z, 0)  # what the block would stand for is more than what is known
         elif new or not self.waiting:
             self.add(Z, d, e, new)
@@ -233,6 +231,7 @@ class Plant:
         # The noise, with the earlier estimate counting as n samples: a short record leaves little noise by chance.
         counted = max(self.count - split / 2, 0.0) + self.n
         self.q = np.maximum((residual + self.n * self.q) / counted, 1e-6 * self.ee / self.count)
+        self.theta[K:] *= min(math.sqrt(q / np.mean(self.q)), 1.0)  # if q rises, draws keep their size
         # By chance alone, n taps explain n q. James and Stein: what is not significant is not played.
         explained = np.sum(theta[:, :split] @ self.G[:split, :split] * theta[:, :split])
         self.significant = max(0.0, 1.0 - 2 * split * np.sum(self.q) / max(explained, 1e-300))
@@ -241,10 +240,14 @@ class Plant:
         return True
 
     def paths(self):
-        """Return primary paths (rows, I, N) and secondary ones (rows, J, N), whose sums are the posterior's expectations."""
+        """Return primary paths (rows, I, N) and secondary ones (rows, J, M): those of the microphones, then draws.
+
+        The posterior's expectations are sums over the rows. Of p is taken what is significant.
+        """
         draws = math.sqrt(self.K / core.DRAWS * np.mean(self.q)) * self.theta[self.K :]  # of the mean noise
-        rows = np.concatenate([self.theta[: self.K], draws]).reshape(-1, self.C, self.N)
-        return self.significant * rows[:, : self.split // self.N], rows[:, self.split // self.N :]
+        rows = np.concatenate([self.theta[: self.K], draws])
+        p, s = (part.reshape(len(rows), -1, self.N) for part in np.split(rows, [self.split], axis=1))
+        return self.significant * p, s[..., : self.M]
 
 
 class Window:
@@ -275,14 +278,13 @@ class PowerBudget(Controller):
 
     rated_power: np.ndarray  # (J,)
     fs: float = 16000.0
-    averaging_s: float = 10.0
-    spread: float = 0.3  # of the secondary paths at the start; 0: they are exact
-    block_s: float = 0.032
+    averaging_s: float = DEFAULT_AVERAGING_S
+    spread: float = DEFAULT_UNCERTAINTY  # of the secondary paths at the start; 0: they are exact
 
     def __post_init__(self):
         super().__post_init__()
         (_, J, M), (_, I, L) = self.s_hat.shape, self.w.shape  # noqa: E741
-        self.N, self.B = L + M - 1, max(round(self.block_s * self.fs), 1)
+        self.N, self.B = L + M - 1, max(round(BLOCK_S * self.fs), 1)
         self.g = math.exp(-1 / (min(self.averaging_s / WINDOWS, WINDOW_S) * self.fs))  # of the window of x, a sample
         self.plant = Plant(self.s_hat, I, self.N, self.B, self.spread, math.exp(-self.B / (MEMORY_S * self.fs)))
         self.window, self.short = (Window(I, self.N, g, self.B) for g in (self.g, self.g**core.SHORTER))
@@ -307,9 +309,8 @@ class PowerBudget(Controller):
     def output(self):
         """Return y_j = sum_i v_ji * x_i, cut to what the account has left, and note what is asked."""
         y = super().output()
-        most = np.sqrt(self.room)
+        most = np.sqrt(np.maximum(self.room - sum(self.asked), 0.0))
         y = np.clip(y, -most, most)
-        self.room = np.maximum(self.room - y**2, 0.0)
         self.asked.append(y**2)
         return y
 
@@ -329,7 +330,7 @@ class PowerBudget(Controller):
         self.y_past = np.concatenate([self.y_past, y], axis=1)[:, self.B :]
         self.lags, self.short_lags = self.window.take(self.x_past), self.short.take(self.x_past)
         if self.asked:
-            spent = np.sum(self.asked, axis=0) / (self.B * self.rated_power)
+            spent = sum(self.asked) / (self.B * self.rated_power)
             self.book = np.concatenate([[spent], self.book[:-1]])
         self.new, self.asked = [], []
         self.set_room()
