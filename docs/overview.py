@@ -29,7 +29,7 @@ from kfopc_filterpy.bounds import WienerSolution, wiener_solution
 from kfopc_filterpy.plot import curve_style
 
 FS, TAPS, SWITCH_ON_S = 16000.0, 256, 0.5
-CLIP = 3.0  # times the root of the rated power; at 2, the clipped peaks of the compressor would cost KF-PB another 5 dB
+CLIP = 3.0  # times the root of the rated power; at 2, the clipped peaks of the compressor would cost KF-PB up to 12 dB
 LEVELS_DB = tuple(float(level) for level in np.arange(-3.0, 12.1, 1.5))
 ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB")
 SAID = {"KF-ANC": "plain Kalman filter", "KF-OPC": "KF-OPC", "KF-PB": "KF-PB"}
