@@ -174,26 +174,35 @@ static int32_t all_taps(const budget *f) { return f->s.J * f->s.I * f->s.L; }
 /* Return the factor of the short window, a sample. */
 static real short_window(const budget *f) { return raised(*f->s.setting[WINDOW], SHORTER); }
 
+/* Add the lags of the block, which fades by `slow` a sample, to sums, (I, I, N); it may fade in,
+ * too. Return the sum of its squared weights. */
+static real add_block(budget *f, real *sums, real slow, int fades_in)
+{
+    const int32_t I = f->s.I, N = f->posterior.N, B = f->posterior.B, length = B + N - 1;
+    real all = 0, share = 1;
+    for (int32_t t = 0; t < length; t++, share *= slow) {
+        const real from_begin = ((real)(B - t) - (real)0.5) / (real)B;
+        const real fade_in = fades_in && t < B ? 1 - from_begin * from_begin : 1;
+        const real weight = share * fade_in;
+        for (int32_t i = 0; i < I; i++)
+            f->window[times(i, length) + (size_t)t] = weight * history_of(&f->posterior, i)[t];
+        if (t < B) all += weight * weight;
+    }
+    for (int32_t i = 0; i < I; i++)
+        for (int32_t a = 0; a < I; a++)
+            add_lags(&f->posterior.fourier, sums + times(i * I + a, N),
+                     f->window + times(i, length), B, f->window + times(a, length), N);
+    return all;
+}
+
 /* Add the block to a window of the references, (I, I, N), and to its weight. Set the lags to those
  * of a window into which the newest block fades in: without its edge, on which a filter would ring.
  * Both are lags of one faded signal, hence positive definite. */
 static void take_references(budget *f, real *sums, real *weight, real g)
 {
     const int32_t I = f->s.I, N = f->posterior.N, B = f->posterior.B;
-    const fourier *F = &f->posterior.fourier;
-    const size_t length = (size_t)(B + N - 1);
     const real fade = raised(g, B), slow = root(g);
-    real all = 0, soft = 0, share = 1, loud = 0, usual = 0;
-    for (int32_t t = 0; t < (int32_t)length; t++, share *= slow) {
-        const real from_begin = ((real)(B - t) - (real)0.5) / (real)B;
-        const real fade_in = t < B ? 1 - from_begin * from_begin : 1;
-        for (int32_t i = 0; i < I; i++)
-            f->window[(size_t)i * length + (size_t)t] =
-                share * fade_in * history_of(&f->posterior, i)[t];
-        if (t >= B) continue;
-        all += share * share;
-        soft += share * share * fade_in * fade_in;
-    }
+    real loud = 0, usual = 0;
     for (int32_t i = 0; i < I; i++) {
         const real *x = history_of(&f->posterior, i);
         loud += dot(x, x, B) / (real)B;
@@ -203,20 +212,9 @@ static void take_references(budget *f, real *sums, real *weight, real g)
      */
     if (loud * *weight > LOUDER * usual) *weight = usual / loud;
     for (size_t n = 0; n < times(I * I, N); n++) f->lags[n] = sums[n] = faded(sums[n], fade, 0);
-    for (int32_t i = 0; i < I; i++)
-        for (int32_t a = 0; a < I; a++)
-            add_lags(F, f->lags + times(i * I + a, N), f->window + (size_t)i * length, B,
-                     f->window + (size_t)a * length, N);
-    for (size_t n = 0; n < times(I * I, N); n++) f->lags[n] /= fade * *weight + soft;
-    share = 1;
-    for (int32_t t = 0; t < (int32_t)length; t++, share *= slow)
-        for (int32_t i = 0; i < I; i++)
-            f->window[(size_t)i * length + (size_t)t] = share * history_of(&f->posterior, i)[t];
-    for (int32_t i = 0; i < I; i++)
-        for (int32_t a = 0; a < I; a++)
-            add_lags(F, sums + times(i * I + a, N), f->window + (size_t)i * length, B,
-                     f->window + (size_t)a * length, N);
-    *weight = fade * *weight + all;
+    const real soft = fade * *weight + add_block(f, f->lags, slow, 1);
+    for (size_t n = 0; n < times(I * I, N); n++) f->lags[n] /= soft;
+    *weight = fade * *weight + add_block(f, sums, slow, 0);
 }
 
 /* Set the spectra of the lags; their mean square becomes `more` times as large, as if there were
@@ -244,7 +242,7 @@ static void correlate_paths(budget *f)
     const int32_t I = f->s.I, J = f->s.J, M = f->s.M, N = f->posterior.N;
     const fourier *F = &f->posterior.fourier;
     const size_t each = (size_t)F->spectrum;
-    real *path = work_row(f, 0), *P = F->work + 4 * (F->F + 2);
+    real *path = work_row(f, 0), *P = scratch_row(F, 4);
     clear(f->SS, times(J * J, F->spectrum));
     clear(f->products, times(J * I, F->spectrum));
     for (int32_t row = 0; row < f->posterior.rows; row++) {
@@ -272,7 +270,7 @@ static void set_equations(budget *f)
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
     const size_t each = (size_t)F->spectrum;
-    real *sums = f->spectra, *lags = F->work + 3 * (F->F + 2), *behind = F->work + 4 * (F->F + 2);
+    real *sums = f->spectra, *lags = scratch_row(F, 3), *behind = scratch_row(F, 4);
     correlate_paths(f);
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++) {
@@ -306,15 +304,15 @@ static void multiply_references(budget *f, const real *R, real *to, const real *
     const int32_t I = f->s.I, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
     const size_t each = (size_t)F->spectrum;
-    real *sums = F->work + 2 * (F->F + 2);
+    real *sums = scratch_row(F, 2);
     for (int32_t c = 0; c < I; c++) transform(F, f->spectra + (size_t)c * each, v + times(c, L), L);
     for (int32_t i = 0; i < I; i++) {
         clear(sums, each);
         for (int32_t c = 0; c < I; c++)
             add_product(F, sums, R + times(i * I + c, F->spectrum), f->spectra + (size_t)c * each,
                         1, 1);
-        transform_back(F, F->work + 3 * (F->F + 2), sums);
-        copy(to + times(i, L), F->work + 3 * (F->F + 2), (size_t)L);
+        transform_back(F, scratch_row(F, 3), sums);
+        copy(to + times(i, L), scratch_row(F, 3), (size_t)L);
     }
 }
 
@@ -333,7 +331,7 @@ static void multiply_filters(void *self, real *to, const real *v)
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
     const size_t each = (size_t)F->spectrum;
-    real *sums = F->work + 2 * (F->F + 2);
+    real *sums = scratch_row(F, 2);
     for (int32_t ac = 0; ac < J * I; ac++)
         transform(F, f->spectra + (size_t)ac * each, v + times(ac, L), L);
     clear(f->products, (size_t)(J * I) * each);
@@ -351,24 +349,15 @@ static void multiply_filters(void *self, real *to, const real *v)
             for (int32_t a = 0; a < J; a++)
                 add_product(F, sums, f->SS + times(j * J + a, F->spectrum),
                             f->products + times(a * I + i, F->spectrum), 1, 1);
-            transform_back(F, F->work + 3 * (F->F + 2), sums);
-            copy(to + times(j * I + i, L), F->work + 3 * (F->F + 2), (size_t)L);
+            transform_back(F, scratch_row(F, 3), sums);
+            copy(to + times(j * I + i, L), scratch_row(F, 3), (size_t)L);
         }
 }
 
 static void precondition_filters(void *self, real *to, const real *r)
 {
     budget *f = self;
-    const int32_t n = f->s.J * f->s.I, L = f->s.L;
-    const fourier *F = &f->posterior.fourier;
-    const size_t each = (size_t)F->spectrum;
-    for (int32_t ac = 0; ac < n; ac++)
-        transform(F, f->spectra + (size_t)ac * each, r + times(ac, L), L);
-    solve_spectra(F, f->factor, f->spectra, n);
-    for (int32_t ac = 0; ac < n; ac++) {
-        transform_back(F, F->work + 2 * (F->F + 2), f->spectra + (size_t)ac * each);
-        copy(to + times(ac, L), F->work + 2 * (F->F + 2), (size_t)L);
-    }
+    solve_circulants(&f->posterior.fourier, f->factor, f->spectra, to, r, f->s.J * f->s.I, f->s.L);
 }
 
 /* Go some steps from the filters v towards those at the prices. */

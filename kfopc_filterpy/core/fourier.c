@@ -7,8 +7,6 @@ static const real SINGULAR = 1e-6f;
 static const real SINGULAR = 1e-14;
 #endif
 
-static real *work_row_of(const fourier *f, int32_t row) { return f->work + times(row, f->F + 2); }
-
 void layout_fourier(fourier *f, int32_t N, anc_layout *at)
 {
     f->F = 2;
@@ -107,12 +105,12 @@ static real *transform_complex(const fourier *f, real *a, real *b)
 void transform(const fourier *f, real *spectrum, const real *from, int32_t n)
 {
     const int32_t H = f->half;
-    real *a = work_row_of(f, 0), *restrict re = spectrum, *restrict im = spectrum + f->bins;
+    real *a = scratch_row(f, 0), *restrict re = spectrum, *restrict im = spectrum + f->bins;
     for (int32_t k = 0; k < H; k++) {
         a[k] = 2 * k < n ? from[2 * k] : 0;
         a[H + k] = 2 * k + 1 < n ? from[2 * k + 1] : 0;
     }
-    const real *restrict Z = transform_complex(f, a, work_row_of(f, 1));
+    const real *restrict Z = transform_complex(f, a, scratch_row(f, 1));
     const real *restrict c = f->turns + H, *restrict d = f->turns + f->F + H;
     re[0] = Z[0] + Z[H];
     re[H] = Z[0] - Z[H];
@@ -131,7 +129,7 @@ void transform_back(const fourier *f, real *to, const real *spectrum)
     const real scale = 1 / (real)f->F, *restrict re = spectrum, *restrict im = spectrum + f->bins;
     const real *restrict c = f->turns + H, *restrict d = f->turns + f->F + H;
     real *restrict a =
-        work_row_of(f, 0); /* with the parts exchanged, the transform is the inverse */
+        scratch_row(f, 0); /* with the parts exchanged, the transform is the inverse */
     a[0] = (re[0] - re[H]) * scale;
     a[H] = (re[0] + re[H]) * scale;
     for (int32_t k = 1; k < H; k++) {
@@ -139,7 +137,7 @@ void transform_back(const fourier *f, real *to, const real *spectrum)
         a[H + k] = (re[k] + re[H - k] - (x * d[k] + y * c[k])) * scale;
         a[k] = (im[k] - im[H - k] + (x * c[k] - y * d[k])) * scale;
     }
-    const real *Z = transform_complex(f, a, work_row_of(f, 1));
+    const real *Z = transform_complex(f, a, scratch_row(f, 1));
     for (int32_t k = 0; k < H; k++) {
         to[2 * k] = Z[H + k];
         to[2 * k + 1] = Z[k];
@@ -148,7 +146,7 @@ void transform_back(const fourier *f, real *to, const real *spectrum)
 
 void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *v, int32_t lags)
 {
-    real *U = work_row_of(f, 2), *V = work_row_of(f, 3), *sums = work_row_of(f, 4);
+    real *U = scratch_row(f, 2), *V = scratch_row(f, 3), *sums = scratch_row(f, 4);
     const int32_t part = f->F - lags + 1;
     clear(sums, (size_t)f->spectrum);
     for (int32_t begin = 0; begin < n; begin += part) {
@@ -164,7 +162,7 @@ void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *
 void transform_lags(const fourier *f, real *spectrum, const real *ahead, const real *behind,
                     int32_t n, int smooth)
 {
-    real *lags = work_row_of(f, 2);
+    real *lags = scratch_row(f, 2);
     clear(lags, (size_t)f->F);
     lags[0] = ahead[0];
     for (int32_t l = 1; l < n; l++) {
@@ -178,7 +176,7 @@ void transform_lags(const fourier *f, real *spectrum, const real *ahead, const r
 void factorise_spectra(const fourier *f, real *A, int32_t n)
 {
     const size_t each = (size_t)f->spectrum;
-    real *least = work_row_of(f, 2);
+    real *least = scratch_row(f, 2);
     for (int32_t i = 0; i < n; i++) {
         real *row = A + times(i, n) * each, *restrict diagonal = row + (size_t)i * each;
         for (int32_t k = 0; k < f->bins; k++) least[k] = SINGULAR * diagonal[k];
@@ -217,6 +215,19 @@ void solve_spectra(const fourier *f, const real *factor, real *x, int32_t n)
             add_product(f, x + (size_t)i * each, factor + (times(k, n) + (size_t)i) * each,
                         x + (size_t)k * each, -1, -1);
         scale_spectrum(f, x + (size_t)i * each, factor + (times(i, n) + (size_t)i) * each);
+    }
+}
+
+void solve_circulants(const fourier *f, const real *factor, real *spectra, real *to, const real *r,
+                      int32_t n, int32_t taps)
+{
+    real *part = scratch_row(f, 2);
+    for (int32_t i = 0; i < n; i++)
+        transform(f, spectra + times(i, f->spectrum), r + times(i, taps), taps);
+    solve_spectra(f, factor, spectra, n);
+    for (int32_t i = 0; i < n; i++) {
+        transform_back(f, part, spectra + times(i, f->spectrum));
+        copy(to + times(i, taps), part, (size_t)taps);
     }
 }
 

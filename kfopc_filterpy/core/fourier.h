@@ -12,6 +12,11 @@ typedef struct {
     real *work;            /* (5, F + 2) of a transform, and of sums at lags */
 } fourier;
 
+/* Return a row of the scratch memory. Transforms use the first two, sums at lags all five. */
+static inline real *scratch_row(const fourier *f, int32_t row)
+{
+    return f->work + times(row, f->F + 2);
+}
 /* Lay out transforms for the lags of N taps. */
 void layout_fourier(fourier *f, int32_t N, anc_layout *at);
 void start_fourier(const fourier *f);
@@ -45,6 +50,10 @@ static inline void add_product(const fourier *f, real *restrict to, const real *
 void factorise_spectra(const fourier *f, real *A, int32_t n);
 /* Solve for the right side x, n spectra, in place. */
 void solve_spectra(const fourier *f, const real *factor, real *x, int32_t n);
+/* Solve for the right side r, n rows of taps, with the factor of circulants; the first taps of the
+ * solution are `to`. The spectra, n, are overwritten. */
+void solve_circulants(const fourier *f, const real *factor, real *spectra, real *to, const real *r,
+                      int32_t n, int32_t taps);
 
 /* Equations A v = b of n numbers, and approximate ones that are solved at once. */
 typedef struct {

@@ -200,7 +200,7 @@ static void leave_out(posterior *f, const real *edge, const real *T, real *out, 
 {
     const fourier *F = &f->fourier;
     const size_t each = (size_t)F->spectrum;
-    real *sums = f->spectra + times(f->C, F->spectrum), *rows = F->work + 2 * (F->F + 2);
+    real *sums = f->spectra + times(f->C, F->spectrum), *rows = scratch_row(F, 2);
     clear(sums, each);
     for (int32_t c = 0; c < f->C; c++)
         add_product(F, sums, edge + (size_t)c * each, T + (size_t)c * each, 1, -turn);
@@ -226,7 +226,7 @@ static void multiply_data(posterior *f, real *to, const real *t, real q)
                         T + (size_t)c * each, 1, 1);
     leave_out(f, f->ahead_at, T, out, 1, N, 1);
     leave_out(f, f->before_at, T, out, 0, N - 1, -1);
-    real *part = F->work + 2 * (F->F + 2);
+    real *part = scratch_row(F, 2);
     for (int32_t c = 0; c < C; c++) {
         const int32_t n = taps_in(f, c);
         const real ridge = q * precision_of(f, c);
@@ -246,17 +246,9 @@ static void multiply_posterior(void *self, real *to, const real *t)
 static void precondition_posterior(void *self, real *to, const real *r)
 {
     posterior *f = self;
-    const fourier *F = &f->fourier;
-    const size_t each = (size_t)F->spectrum;
-    real *part = F->work + 2 * (F->F + 2);
-    for (int32_t c = 0; c < f->C; c++)
-        transform(F, f->spectra + (size_t)c * each, r + times(c, f->N), f->N);
-    solve_spectra(F, f->factor, f->spectra, f->C);
-    clear(to, times(f->C, f->N));
-    for (int32_t c = 0; c < f->C; c++) {
-        transform_back(F, part, f->spectra + (size_t)c * each);
-        copy(to + times(c, f->N), part, (size_t)taps_in(f, c));
-    }
+    solve_circulants(&f->fourier, f->factor, f->spectra, to, r, f->C, f->N);
+    for (int32_t c = f->I; c < f->C; c++)
+        for (int32_t i = f->M; i < f->N; i++) to[times(c, f->N) + (size_t)i] = 0;
 }
 
 /* Set the spectra of the data. */
