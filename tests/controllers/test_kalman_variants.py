@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import toeplitz
 
 from kfopc_filterpy import Plant, diagonal_kf, fx_rls, kf_anc, simulate
+from kfopc_filterpy.core.triangle import GROUP
 from kfopc_filterpy.paths import PathTolerance
 
 L = 6
@@ -97,3 +98,63 @@ def test_a_variance_of_long_ago_refuses_no_loud_reference() -> None:
         y = controller.control_signal(sample)
         controller.update(2.0 * sample - y)
     np.testing.assert_allclose(controller.weights, 2.0 * (x @ x) / (x @ x + q / P0), rtol=1e-6)  # P0's rounding over q
+
+
+# P at the limits of a float: rows of any direction, as each reference has one tap and the path is 1
+
+
+def heard(controller: Any, row: Any, e: float) -> None:
+    controller.control_signal(row)
+    controller.update(e)
+
+
+def test_a_variance_counts_as_long_as_any_weight_has_it() -> None:
+    """3 P x'x' is above 1e300 until the last of three variances has fallen from 1e290 to the measurement noise."""
+    loud = np.full(3, 4e5)
+    for left in range(3):
+        controller = kf_anc(1, [1.0], n_references=3, state_noise=0.0, measurement_noise=1e280, initial_variance=1e290)
+        order = [*(k for k in range(3) if k != left), left]
+        for k in order:
+            with pytest.raises(ValueError, match="P is too large"):
+                heard(controller, loud, 1.0)
+            heard(controller, np.eye(3)[k], 1.0)
+            heard(controller, np.zeros(3), 1.0)
+        heard(controller, loud, 1.0)
+
+
+@pytest.mark.parametrize(("least", "away"), [(-0.3, 0.4), (-0.01, 0.03), (-1e-6, 1e-4)])
+def test_an_indefinite_p_is_raised_by_twice_its_least_eigenvalue(least: float, away: float) -> None:
+    """Rounding may make P indefinite: then the sample is measured as with P - 2 least I, whose least eigenvalue is -least.
+
+    One direction v has another eigenvalue than the others, 0.9, so it lies in the plane of a row h and P h. A dense update
+    is exact to rounding: 1e-12 of P is a thousand times as much as it came to.
+    """
+    n, q = 20, 0.1  # two groups of rows and a part of one, as the core keeps P
+    v, beside = np.linalg.qr(np.random.default_rng(0).normal(size=(n, 2)))[0].T
+    P = 0.9 * np.eye(n) + (least - 0.9) * np.outer(v, v)
+    h = v + away * beside
+    assert h @ P @ h < 0.0
+    controller = kf_anc(1, [1.0], n_references=n, state_noise=0.0, measurement_noise=q)
+    square = np.pad(P, (0, -n % GROUP))
+    rows = [square[i : i + GROUP, : i + GROUP] for i in range(0, len(square), GROUP)]
+    controller._block.fields["triangle"].ravel()[:] = np.concatenate([row.ravel() for row in rows])
+    heard(controller, h, 1.0)
+    raised = P + 2.0 * np.abs(np.linalg.eigvalsh(P)[0]) * np.eye(n)
+    g, S = raised @ h, h @ raised @ h + q
+    np.testing.assert_allclose(controller.covariance, raised - np.outer(g, g) / S, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(controller.weights.ravel(), g / S, rtol=0, atol=1e-12)
+    assert np.linalg.eigvalsh(controller.covariance)[0] > 0.0
+
+
+def test_what_is_known_exactly_brings_a_rounding_of_state_noise() -> None:
+    """An h'P h below 16 roundings of the largest variance becomes 16; from then on, each sample adds 2.
+
+    To the bit: 1 plus a whole number of roundings is a float.
+    """
+    controller = kf_anc(1, [1.0], n_references=3, state_noise=0.0, measurement_noise=0.0)
+    known = np.eye(3)[1]
+    for row, roundings in ((known, 0), (known, 16), (np.zeros(3), 18), (np.zeros(3), 20)):
+        heard(controller, row, 1.0)
+        variances = np.diag(controller.covariance)
+        np.testing.assert_array_equal(variances[[0, 2]], 1.0 + roundings * np.finfo(float).eps)
+    assert variances[1] == 4.0 * np.finfo(float).eps
