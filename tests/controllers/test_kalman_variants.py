@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import toeplitz
 
 from kfopc_filterpy import Plant, diagonal_kf, fx_rls, kf_anc, simulate
+from kfopc_filterpy.core.block import Algorithm, Block, Shape
 from kfopc_filterpy.core.triangle import GROUP
 from kfopc_filterpy.paths import PathTolerance
 
@@ -32,6 +33,28 @@ def test_fxrls_is_the_weighted_least_squares(forgetting: float) -> None:
     weight = forgetting ** np.arange(x.size - 1, -1, -1.0)
     normal = H.T @ (weight[:, None] * H) + forgetting**x.size / 2.0 * np.eye(L)
     np.testing.assert_allclose(controller.weights, np.linalg.solve(normal, H.T @ (weight * d)), rtol=0, atol=1e-10)
+
+
+def test_two_bad_samples_stop_no_forgetting() -> None:
+    """One reference is 1e4 times as loud for two samples: 1e8 times the variance is left along the others.
+
+    The filter with fading memory remains the weighted least squares of the test above.
+    """
+    forgetting, rng = 0.99, np.random.default_rng(0)
+    H, noise = rng.standard_normal((300, 3)), 0.1 * rng.standard_normal(300)
+    H[200:202] = [1e4, 0.0, 0.0]
+    d = H @ [1.0, -0.5, 0.3] + noise
+    settings = {"state_noise": 0.0, "measurement_noise": 1.0, "initial_variance": 1.0, "fading": 1.0 / forgetting}
+    block = Block(Algorithm("kalman"), Shape(1, 1, 3, 1, 1), path=np.ones(1), settings=settings)
+    for row, sample in zip(H, d, strict=True):
+        block.reference[:] = row
+        assert block.emit() == 0
+        block.error[:] = sample - block.control_signal
+        assert block.update() == 0
+    weight = forgetting ** np.arange(299, -1, -1.0)
+    normal = H.T @ (weight[:, None] * H) + forgetting**300 * np.eye(3)
+    expected = np.linalg.solve(normal, H.T @ (weight * d))
+    np.testing.assert_allclose(block.fields["weights"].ravel(), expected, rtol=0, atol=1e-10)
 
 
 def test_diagonal_variances_stay_positive_and_a_silent_reference_tells_nothing() -> None:

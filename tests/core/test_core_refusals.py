@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +15,7 @@ from hypothesis import strategies as st
 
 from kfopc_filterpy import OutputLimiter
 from kfopc_filterpy.core import building
-from kfopc_filterpy.core.block import Algorithm, Block, Shape
+from kfopc_filterpy.core.block import Algorithm, Block, Shape, _plan_of
 from kfopc_filterpy.core.calls import limit
 
 ANY_NUMBER = st.one_of(
@@ -24,6 +27,7 @@ ANY_NUMBER = st.one_of(
 COUNT = st.integers(1, 4)
 ODD_COUNT = st.one_of(COUNT, st.sampled_from([0, -1, 2**31 - 1, 2**31, 2**32 + 1, -(2**31)]))
 TAPS = st.integers(1, 70)
+GUARDED = Shape(1, 1, 1, 8, 3, guard_taps=2)
 
 
 def at_times(draw: st.DrawFn, one_in: int) -> bool:
@@ -137,6 +141,40 @@ def test_a_setting_without_an_upper_limit_may_be_large() -> None:
     for name in ("mov", "mov_fixed"):
         with pytest.raises(ValueError, match="modified"):
             block(name, modified=2.0)
+
+
+def opened(plan: Mapping[str, Any], size: int, *, begin: int = 0, shape: Shape = GUARDED) -> bool:
+    """Return whether `anc_open` makes FxLMS of a plan's arrays in `size` bytes."""
+    algorithm, view, memory = (
+        Algorithm("fxlms"),
+        (ctypes.c_void_p * 512)(),
+        np.full(size // 8 + 2, np.nan),
+    )  # room enough
+    arrays = {name: np.array(values, float) for name, values in plan.items()}
+    described = algorithm.pointer, ctypes.byref(_plan_of(shape, arrays))
+    return bool(algorithm.library.held.anc_open(*described, view, memory.ctypes.data + begin, size, True))
+
+
+def test_a_host_in_c_gets_no_controller_for_a_plan_or_memory_that_is_not_whole() -> None:
+    """NULL for what is needed, a number that is none at any place, too few bytes, or memory that begins within a real."""
+    whole: dict[str, list[float]] = {"path": [0.0, 1.0, 0.5], "guard": [1.0, 0.1], "settings": [0.01]}
+    size = Block(
+        Algorithm("fxlms"), GUARDED, path=np.ones(3), guard=np.ones(2), settings={"step_size": 1.0}
+    ).memory.size
+    assert opened(whole, size)
+    for name, values in whole.items():
+        assert not opened(whole | {name: []}, size), name
+        for place in range(len(values)):
+            for bad in (np.nan, np.inf, -np.inf):
+                assert not opened(whole | {name: [*values[:place], bad, *values[place + 1 :]]}, size), (
+                    name,
+                    place,
+                    bad,
+                )
+    assert not opened(whole, size - 1)
+    for begin in range(1, 8):
+        assert not opened(whole, size, begin=begin)
+    assert not opened(whole, size, shape=replace(GUARDED, taps=0))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
