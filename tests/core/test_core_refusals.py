@@ -145,11 +145,8 @@ def test_a_setting_without_an_upper_limit_may_be_large() -> None:
 
 def opened(plan: Mapping[str, Any], size: int, *, begin: int = 0, shape: Shape = GUARDED) -> bool:
     """Return whether `anc_open` makes FxLMS of a plan's arrays in `size` bytes."""
-    algorithm, view, memory = (
-        Algorithm("fxlms"),
-        (ctypes.c_void_p * 512)(),
-        np.full(size // 8 + 2, np.nan),
-    )  # room enough
+    algorithm, view = Algorithm("fxlms"), (ctypes.c_void_p * 512)()  # more than a view has
+    memory = np.full(size // 8 + 2, np.nan)
     arrays = {name: np.array(values, float) for name, values in plan.items()}
     described = algorithm.pointer, ctypes.byref(_plan_of(shape, arrays))
     return bool(algorithm.library.held.anc_open(*described, view, memory.ctypes.data + begin, size, True))
