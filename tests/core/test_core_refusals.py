@@ -108,6 +108,7 @@ def test_under_sanitizers(name: str, real: str, plans: list[tuple[str, ...]], tm
         ({"microphones": 16, "loudspeakers": 16, "references": 16}, "taps", 16_320),  # KJI (4 L + 256)
         ({"scenarios": 2**11, "loudspeakers": 2, "references": 2}, "taps", 2**15),  # SJIL
         ({"scenarios": 2**20}, "microphones", 2**8),  # SK
+        ({"microphones": 2**8}, "scenarios", 2**20),
         ({"scenarios": 2**19, "loudspeakers": 2}, "path_taps", 48),  # SJ (4 M + 64)
         ({"loudspeakers": 2, "limiter_windows": (1, 1)}, "power_windows", 44_739_242),  # 3 SJN
         ({"loudspeakers": 2, "power_windows": (0, 0)}, "limiter_windows", 44_739_242),
