@@ -87,7 +87,7 @@ def test_predictions_err_by_a_rounding_of_P0_at_most(kind: str, P0: float, r: fl
             ours.predict()
             ours.update(z, H=row)
             worst = max(worst, abs(z - ours.y.item() - predicted) / S**0.5)
-    assert worst <= 2e-15 * P0  # it was at most 1.5e-15 P0 at 1e6, 3e-16 P0 at 1e12
+    assert worst <= 5e-15 * P0  # it was at most 1.5e-15 P0 at 1e6, 3e-16 P0 at 1e12
     assert np.linalg.eigvalsh(ours.P).min() > 0
 
 
