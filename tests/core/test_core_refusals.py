@@ -27,7 +27,7 @@ ANY_NUMBER = st.one_of(
 COUNT = st.integers(1, 4)
 ODD_COUNT = st.one_of(COUNT, st.sampled_from([0, -1, 2**31 - 1, 2**31, 2**32 + 1, -(2**31)]))
 TAPS = st.integers(1, 70)
-GUARDED = Shape(1, 1, 1, 8, 3, guard_taps=2)
+GUARDED = Shape(1, 2, 1, 8, 3, guard_taps=2)
 
 
 def at_times(draw: st.DrawFn, one_in: int) -> bool:
@@ -105,6 +105,7 @@ def test_under_sanitizers(name: str, real: str, plans: list[tuple[str, ...]], tm
         ({}, "guard_taps", 48),
         ({}, "taps", 33_554_316),  # (I + KJ) (4 (L + M) + 448) is at most 2^28
         ({"microphones": 2}, "taps", 22_369_505),
+        ({"microphones": 16, "loudspeakers": 16}, "taps", 261_007),
         ({"microphones": 16, "loudspeakers": 16, "references": 16}, "taps", 16_320),  # KJI (4 L + 256)
         ({"scenarios": 2**11, "loudspeakers": 2, "references": 2}, "taps", 2**15),  # SJIL
         ({"scenarios": 2**20}, "microphones", 2**8),  # SK
@@ -155,9 +156,9 @@ def opened(plan: Mapping[str, Any], size: int, *, begin: int = 0, shape: Shape =
 
 def test_a_host_in_c_gets_no_controller_for_a_plan_or_memory_that_is_not_whole() -> None:
     """NULL for what is needed, a number that is none at any place, too few bytes, or memory that begins within a real."""
-    whole: dict[str, list[float]] = {"path": [0.0, 1.0, 0.5], "guard": [1.0, 0.1], "settings": [0.01]}
+    whole: dict[str, list[float]] = {"path": [0.0, 1.0, 0.5, 0.3, -0.2, 0.1], "guard": [1.0, 0.1], "settings": [0.01]}
     size = Block(
-        Algorithm("fxlms"), GUARDED, path=np.ones(3), guard=np.ones(2), settings={"step_size": 1.0}
+        Algorithm("fxlms"), GUARDED, path=np.ones(6), guard=np.ones(2), settings={"step_size": 1.0}
     ).memory.size
     assert opened(whole, size)
     for name, values in whole.items():
