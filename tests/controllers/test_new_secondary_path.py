@@ -104,6 +104,17 @@ def test_a_shorter_path_is_filled_with_zeros_and_the_users_array_is_not_touched(
     assert controller.secondary[1] == 0.25
 
 
+@pytest.mark.parametrize("gain", [1e3, 1.0, 10.0])
+def test_the_loudest_reference_is_that_of_the_new_path(gain: float) -> None:
+    """1e25 over the sum of the path's sizes, as of a controller that is made with it."""
+    controller, path = fx_lms(N_TAPS, [0.0, 20.0], step_size=MU), [0.75 * gain, -0.25 * gain]
+    controller.secondary = path
+    for one in (controller, fx_lms(N_TAPS, path, step_size=MU)):
+        one.control_signal(0.99e25 / gain)
+        with pytest.raises(ValueError, match="the reference is too loud"):
+            one.control_signal(1.01e25 / gain)
+
+
 @pytest.mark.parametrize(
     ("path", "bad", "message"),
     [
