@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -217,6 +218,21 @@ def test_a_guard_that_would_take_more_than_1e50_is_refused() -> None:
     with pytest.raises(ValueError, match="step"):
         made.update(0.0)
     np.testing.assert_allclose(made.weights, [1.8e50])
+
+
+@pytest.mark.parametrize("size", [0.6e50, 0.8e50])
+def test_a_penalty_that_would_take_more_than_1e50_is_refused(size: float) -> None:
+    """Two weights grow one after the other; then both play, and the penalty takes them away: a step of sqrt(2) size."""
+    made, e = mov_fx_lms(3, [1.0], step_size=0.5, penalty_factor=10.0), 2.0 * size
+    for x, error in ((1.0, e), (0.0, e), (0.0, 0.0), (0.0, 0.0), (1.0, e)):  # the last e makes up for the penalty
+        made.control_signal(x)
+        made.update(error)
+    np.testing.assert_allclose(made.weights, [size, size, 0.0])
+    made.control_signal(1.0)
+    refused = np.sqrt(2.0) * size > 1e50
+    with pytest.raises(ValueError, match="step") if refused else nullcontext():
+        made.update(0.0)
+    np.testing.assert_allclose(made.weights, [size * refused, size * refused, 0.0], atol=1e36)
 
 
 @pytest.mark.parametrize("at", [*np.ndindex(2, 3)])
