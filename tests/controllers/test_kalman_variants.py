@@ -57,6 +57,23 @@ def test_two_bad_samples_stop_no_forgetting() -> None:
     np.testing.assert_allclose(block.fields["weights"].ravel(), expected, rtol=0, atol=1e-10)
 
 
+def test_what_was_loud_once_is_forgotten() -> None:
+    """After 200 samples that were 1e4 times as loud, P grows until FxRLS is the weighted least squares again.
+
+    It takes 2800 samples here; the memory is of 10.
+    """
+    n, forgetting, rng = 3000, 0.9, np.random.default_rng(0)
+    x, noise = rng.standard_normal((2, n))
+    x[:200] *= 1e4
+    d = np.convolve(x, [1.0, -0.5, 0.3])[:n] + 0.1 * noise
+    d[1000:] *= -1.0
+    controller = fx_rls(L, [1.0], forgetting=forgetting)
+    simulate(controller, x, Plant([1.0], fs=FS), disturbance=d)
+    H, weight = toeplitz(x, np.zeros(L)), forgetting ** np.arange(n - 1, -1, -1.0)
+    expected = np.linalg.solve(H.T @ (weight[:, None] * H), H.T @ (weight * d))
+    np.testing.assert_allclose(controller.weights, expected, rtol=0, atol=1e-10)
+
+
 def test_diagonal_variances_stay_positive_and_a_silent_reference_tells_nothing() -> None:
     controller = diagonal_kf(L, PATH, state_noise=0.0, measurement_noise=0.0)
     result = simulate(controller, np.zeros(50), Plant(PATH, fs=FS), disturbance=np.ones(50))
