@@ -74,6 +74,28 @@ def test_what_was_loud_once_is_forgotten() -> None:
     np.testing.assert_allclose(controller.weights, expected, rtol=0, atol=1e-10)
 
 
+def test_along_a_tone_fxrls_forgets_and_elsewhere_its_variance_stays() -> None:
+    """P grows until its largest variance is 1e4 times the usual one along the rows.
+
+    From then on noise takes the place of fading. Along the rows, it leaves more than half of the variance that forgetting
+    does, 0.7 of it here, and nowhere does P grow.
+    """
+    forgetting, x = 0.99, np.sin(0.3 * np.arange(8000))
+    controller, H, largest = fx_rls(L, [1.0], forgetting=forgetting), toeplitz(x, np.zeros(L)), []
+    for n in range(x.size):
+        controller.control_signal(x[n])
+        controller.update(0.0)
+        if n % 2000 < 1999:
+            continue
+        rows, weight = H[n - 20 : n + 1], forgetting ** np.arange(n, -1, -1.0)  # a period
+        forgotten = np.linalg.pinv(H[: n + 1].T @ (weight[:, None] * H[: n + 1]), rcond=1e-9)
+        along, by_forgetting = (np.mean(np.sum(rows @ P * rows, 1)) for P in (controller.covariance, forgotten))
+        assert 0.5 * by_forgetting < along < by_forgetting
+        largest.append(np.diag(controller.covariance).max())
+        assert 0.5e4 * along < largest[-1] * np.mean(np.sum(rows**2, 1)) < 1e4 * along
+    np.testing.assert_allclose(largest, largest[0], rtol=0.01)
+
+
 def test_diagonal_variances_stay_positive_and_a_silent_reference_tells_nothing() -> None:
     controller = diagonal_kf(L, PATH, state_noise=0.0, measurement_noise=0.0)
     result = simulate(controller, np.zeros(50), Plant(PATH, fs=FS), disturbance=np.ones(50))
