@@ -109,7 +109,7 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     }
     layout_posterior(&f->posterior, s, (int32_t)block, !own || own[SPREAD - 1] == 0, at);
     const int32_t I = s->I, L = s->L, N = f->posterior.N, B = f->posterior.B;
-    const int32_t spectrum = f->posterior.fourier.spectrum;
+    const int32_t spectrum = f->posterior.fourier.F;
     f->T = (int32_t)averaging;
     f->width = N + B;
     f->asked = reals(at, "asked", ANC_STATE, 1, 1, 3, J);
@@ -227,9 +227,9 @@ static void transform_references(budget *f, real *spectra, real more, int32_t n,
         for (int32_t a = 0; a < I; a++) {
             const real *ahead = f->lags + times(a * I + i, N),
                        *behind = f->lags + times(i * I + a, N);
-            real *spectrum = spectra + times(i * I + a, F->spectrum);
+            real *spectrum = spectra + times(i * I + a, F->F);
             transform_lags(F, spectrum, ahead, behind, n, smooth);
-            for (int32_t k = 0; i == a && k < F->bins; k++) spectrum[k] += more * ahead[0];
+            for (int32_t k = 0; i == a && k < F->half; k++) spectrum[k] += more * ahead[0];
         }
 }
 
@@ -241,10 +241,10 @@ static void correlate_paths(budget *f)
 {
     const int32_t I = f->s.I, J = f->s.J, M = f->s.M, N = f->posterior.N;
     const fourier *F = &f->posterior.fourier;
-    const size_t each = (size_t)F->spectrum;
+    const size_t each = (size_t)F->F;
     real *path = work_row(f, 0), *P = scratch_row(F, 4);
-    clear(f->SS, times(J * J, F->spectrum));
-    clear(f->products, times(J * I, F->spectrum));
+    clear(f->SS, times(J * J, F->F));
+    clear(f->products, times(J * I, F->F));
     for (int32_t row = 0; row < f->posterior.rows; row++) {
         for (int32_t j = 0; j < J; j++) {
             secondary_of(&f->posterior, row, j, path);
@@ -252,14 +252,14 @@ static void correlate_paths(budget *f)
         }
         for (int32_t j = 0; j < J; j++)
             for (int32_t a = 0; a < J; a++)
-                add_product(F, f->SS + times(j * J + a, F->spectrum), f->spectra + (size_t)j * each,
+                add_product(F, f->SS + times(j * J + a, F->F), f->spectra + (size_t)j * each,
                             f->spectra + (size_t)a * each, 1, -1);
         for (int32_t c = 0; c < I; c++) {
             primary_of(&f->posterior, row, c, path);
             transform(F, P, path, N);
             for (int32_t j = 0; j < J; j++)
-                add_product(F, f->products + times(j * I + c, F->spectrum),
-                            f->spectra + (size_t)j * each, P, 1, -1);
+                add_product(F, f->products + times(j * I + c, F->F), f->spectra + (size_t)j * each,
+                            P, 1, -1);
         }
     }
 }
@@ -269,32 +269,31 @@ static void set_equations(budget *f)
 {
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
-    const size_t each = (size_t)F->spectrum;
+    const size_t each = (size_t)F->F;
     real *sums = f->spectra, *lags = scratch_row(F, 3), *behind = scratch_row(F, 4);
     correlate_paths(f);
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++) {
             clear(sums, each);
             for (int32_t c = 0; c < I; c++)
-                add_product(F, sums, f->products + times(j * I + c, F->spectrum),
-                            f->R_at + times(i * I + c, F->spectrum), 1, 1);
+                add_product(F, sums, f->products + times(j * I + c, F->F),
+                            f->R_at + times(i * I + c, F->F), 1, 1);
             transform_back(F, lags, sums);
             copy(f->b + times(j * I + i, L), lags, (size_t)L);
         }
     for (int32_t j = 0; j < J; j++) {
-        transform_back(F, lags, f->SS + times(j * J + j, F->spectrum));
+        transform_back(F, lags, f->SS + times(j * J + j, F->F));
         f->gain[j] = lags[0];
     }
     for (int32_t ji = 0; ji < J * I; ji++)
         for (int32_t ac = 0; ac <= ji; ac++) {
             const int32_t j = ji / I, i = ji % I, a = ac / I, c = ac % I;
             clear(sums, each);
-            add_product(F, sums, f->SS + times(j * J + a, F->spectrum),
-                        f->R_at + times(i * I + c, F->spectrum), 1, 1);
+            add_product(F, sums, f->SS + times(j * J + a, F->F), f->R_at + times(i * I + c, F->F),
+                        1, 1);
             transform_back(F, lags, sums);
-            for (int32_t l = 1; l < L; l++) behind[l] = lags[F->F - l];
-            transform_lags(F, f->smooth_A + times(ji * J * I + ac, F->spectrum), lags, behind, L,
-                           1);
+            for (int32_t l = 1; l < L; l++) behind[l] = -lags[F->F - l]; /* it is skew */
+            transform_lags(F, f->smooth_A + times(ji * J * I + ac, F->F), lags, behind, L, 1);
         }
 }
 
@@ -303,14 +302,13 @@ static void multiply_references(budget *f, const real *R, real *to, const real *
 {
     const int32_t I = f->s.I, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
-    const size_t each = (size_t)F->spectrum;
+    const size_t each = (size_t)F->F;
     real *sums = scratch_row(F, 2);
     for (int32_t c = 0; c < I; c++) transform(F, f->spectra + (size_t)c * each, v + times(c, L), L);
     for (int32_t i = 0; i < I; i++) {
         clear(sums, each);
         for (int32_t c = 0; c < I; c++)
-            add_product(F, sums, R + times(i * I + c, F->spectrum), f->spectra + (size_t)c * each,
-                        1, 1);
+            add_product(F, sums, R + times(i * I + c, F->F), f->spectra + (size_t)c * each, 1, 1);
         transform_back(F, scratch_row(F, 3), sums);
         copy(to + times(i, L), scratch_row(F, 3), (size_t)L);
     }
@@ -330,7 +328,7 @@ static void multiply_filters(void *self, real *to, const real *v)
     budget *f = self;
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
-    const size_t each = (size_t)F->spectrum;
+    const size_t each = (size_t)F->F;
     real *sums = scratch_row(F, 2);
     for (int32_t ac = 0; ac < J * I; ac++)
         transform(F, f->spectra + (size_t)ac * each, v + times(ac, L), L);
@@ -338,17 +336,17 @@ static void multiply_filters(void *self, real *to, const real *v)
     for (int32_t a = 0; a < J; a++)
         for (int32_t i = 0; i < I; i++)
             for (int32_t c = 0; c < I; c++)
-                add_product(F, f->products + times(a * I + i, F->spectrum),
-                            f->R_at + times(i * I + c, F->spectrum),
-                            f->spectra + times(a * I + c, F->spectrum), 1, 1);
+                add_product(F, f->products + times(a * I + i, F->F),
+                            f->R_at + times(i * I + c, F->F), f->spectra + times(a * I + c, F->F),
+                            1, 1);
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++) {
-            const real *own = f->products + times(j * I + i, F->spectrum);
+            const real *own = f->products + times(j * I + i, F->F);
             const real price = f->priced[j] + REGULAR * f->gain[j];
             for (size_t k = 0; k < each; k++) sums[k] = price * own[k];
             for (int32_t a = 0; a < J; a++)
-                add_product(F, sums, f->SS + times(j * J + a, F->spectrum),
-                            f->products + times(a * I + i, F->spectrum), 1, 1);
+                add_product(F, sums, f->SS + times(j * J + a, F->F),
+                            f->products + times(a * I + i, F->F), 1, 1);
             transform_back(F, scratch_row(F, 3), sums);
             copy(to + times(j * I + i, L), scratch_row(F, 3), (size_t)L);
         }
@@ -367,13 +365,13 @@ static void solve_at(budget *f, const real *prices, real *v)
     const fourier *F = &f->posterior.fourier;
     const equations own = {f, multiply_filters, precondition_filters, n, f->vectors};
     f->priced = prices;
-    copy(f->factor, f->smooth_A, times(J * I * J * I, F->spectrum));
+    copy(f->factor, f->smooth_A, times(J * I * J * I, F->F));
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++)
             for (int32_t c = 0; c <= i; c++)
-                add_scaled(f->factor + times((j * I + i) * J * I + j * I + c, F->spectrum),
-                           prices[j] + REGULAR * f->gain[j],
-                           f->smooth_R + times(i * I + c, F->spectrum), F->spectrum);
+                add_scaled(f->factor + times((j * I + i) * J * I + j * I + c, F->F),
+                           prices[j] + REGULAR * f->gain[j], f->smooth_R + times(i * I + c, F->F),
+                           F->F);
     factorise_spectra(F, f->factor, J * I);
     approach(&own, f->b, v, FILTER_STEPS, 0);
     for (int32_t i = 0; i < n; i++)
@@ -408,23 +406,21 @@ static void set_slopes(budget *f, const real *v, real *H, real *power)
 {
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
-    const size_t each = (size_t)F->spectrum;
+    const size_t each = (size_t)F->F;
     real *u = f->vectors;
     for (int32_t j = 0; j < J; j++) power[j] = power_of(f, f->R_at, v, j, u + times(j, I * L));
     for (int32_t ji = 0; ji < J * I; ji++)
         transform(F, f->products + (size_t)ji * each, u + times(ji, L), L);
     for (int32_t a = 0; a < J; a++) {
-        clear(f->spectra, times(J * I, F->spectrum));
-        copy(f->spectra + times(a * I, F->spectrum), f->products + times(a * I, F->spectrum),
-             times(I, F->spectrum));
+        clear(f->spectra, times(J * I, F->F));
+        copy(f->spectra + times(a * I, F->F), f->products + times(a * I, F->F), times(I, F->F));
         solve_spectra(F, f->factor, f->spectra, J * I);
         for (int32_t j = 0; j < J; j++) {
             H[j * J + a] = 0;
             for (int32_t i = 0; i < I; i++) {
-                const real *x = f->products + times(j * I + i, F->spectrum);
-                const real *y = f->spectra + times(j * I + i, F->spectrum);
-                const real ends = x[0] * y[0] + x[F->half] * y[F->half]; /* the others come twice */
-                H[j * J + a] += (2 * dot(x, y, (int32_t)each) - ends) / (real)F->F;
+                const real *x = f->products + times(j * I + i, F->F);
+                const real *y = f->spectra + times(j * I + i, F->F);
+                H[j * J + a] += 2 * dot(x, y, F->F) / (real)F->F;
             }
         }
     }

@@ -12,11 +12,12 @@ void layout_fourier(fourier *f, int32_t N, anc_layout *at)
     f->F = 2;
     while (f->F < 2 * N) f->F *= 2;
     f->half = f->F / 2;
-    f->bins = f->half + 1;
-    f->spectrum = 2 * f->bins;
-    f->turns = reals(at, "turns", ANC_STATE, 1, 1, 2, f->F);
-    f->work = reals(at, "transform_work", ANC_SCRATCH, 1, 1, 5, f->F + 2);
+    f->turns = reals(at, "turns", ANC_STATE, 1, 1, 2, f->F + f->half);
+    f->work = reals(at, "transform_work", ANC_SCRATCH, 1, 1, 5, f->F);
 }
+
+static const real *cosines(const fourier *f, int32_t m) { return f->turns + m; }
+static const real *sines(const fourier *f, int32_t m) { return f->turns + f->F + f->half + m; }
 
 /* Set the cosines and sines by halving angles: square roots are exact on every machine, a library's
  * cosines are not. */
@@ -27,8 +28,8 @@ void start_fourier(const fourier *f)
         cosine[e] = sqrt((1 + cosine[e - 1]) / 2);
         sine[e] = sine[e - 1] / (2 * cosine[e]);
     }
-    for (int32_t m = 1, e = 0; m <= f->half; m *= 2, e++)
-        for (int32_t p = 0; p < m; p++) {
+    for (int32_t m = 1, e = 0; m <= f->F; m *= 2, e++)
+        for (int32_t p = 0; p < m && p < f->half; p++) {
             double c = 1, s = 0;
             for (int bit = 0; p >> bit; bit++) {
                 if (!(p >> bit & 1)) continue;
@@ -37,27 +38,30 @@ void start_fourier(const fourier *f)
                 c = real_part;
             }
             f->turns[m + p] = (real)c;
-            f->turns[f->F + m + p] = (real)s;
+            f->turns[f->F + f->half + m + p] = (real)s;
         }
 }
 
-/* Set the sums of n times four elements, a quarter apart: 0, 1, 2 and 3 are turned by as many times
- * the angle (c, d). */
-static inline void turn(int32_t n, real c, real d, const real *restrict re, const real *restrict im,
-                        int32_t quarter, real *restrict re0, real *restrict re1, real *restrict re2,
-                        real *restrict re3, real *restrict im0, real *restrict im1,
-                        real *restrict im2, real *restrict im3)
+/* Set n sums of four complex numbers that are a quarter apart; sums 0 to 3 are turned by as many
+ * times an angle, with the cosine c and the sine d: one for all, or one for `each`. */
+static inline void sum_fours(int32_t n, int32_t quarter, const real *restrict c,
+                             const real *restrict d, const int each, const real *restrict re,
+                             const real *restrict im, real *restrict re0, real *restrict re1,
+                             real *restrict re2, real *restrict re3, real *restrict im0,
+                             real *restrict im1, real *restrict im2, real *restrict im3)
 {
-    const real c2 = c * c - d * d, d2 = 2 * c * d, c3 = c * c2 - d * d2, d3 = c * d2 + d * c2;
     for (int32_t q = 0, k = quarter; q < n; q++, k++) {
+        const real c1 = c[each * q], d1 = d[each * q];
+        const real c2 = c1 * c1 - d1 * d1, d2 = 2 * c1 * d1;
+        const real c3 = c1 * c2 - d1 * d2, d3 = c1 * d2 + d1 * c2;
         const real even = re[q] + re[k + quarter], apart = re[q] - re[k + quarter];
         const real even_i = im[q] + im[k + quarter], apart_i = im[q] - im[k + quarter];
         const real odd = re[k] + re[k + 2 * quarter], turned_i = re[k + 2 * quarter] - re[k];
         const real odd_i = im[k] + im[k + 2 * quarter], turned = im[k] - im[k + 2 * quarter];
         re0[q] = even + odd;
         im0[q] = even_i + odd_i;
-        re1[q] = (apart + turned) * c + (apart_i + turned_i) * d;
-        im1[q] = (apart_i + turned_i) * c - (apart + turned) * d;
+        re1[q] = (apart + turned) * c1 + (apart_i + turned_i) * d1;
+        im1[q] = (apart_i + turned_i) * c1 - (apart + turned) * d1;
         re2[q] = (even - odd) * c2 + (even_i - odd_i) * d2;
         im2[q] = (even_i - odd_i) * c2 - (even - odd) * d2;
         re3[q] = (apart - turned) * c3 + (apart_i - turned_i) * d3;
@@ -65,17 +69,39 @@ static inline void turn(int32_t n, real c, real d, const real *restrict re, cons
     }
 }
 
-/* Make a step of Stockham's radix-4 transform, over p < m. */
-static void make_step(const fourier *f, const real *restrict a, real *restrict b, int32_t m,
-                      int32_t s)
+/* Make a step of Stockham's radix-4 transform from a to b: the same sums s times side by side. */
+static void make_step(const fourier *f, const real *a, real *b, int32_t s)
 {
-    const int32_t H = f->half;
-    const real *restrict c = f->turns + 2 * m, *restrict d = f->turns + f->F + 2 * m;
+    const int32_t H = f->half, quarter = H / 4, m = quarter / s;
+    const real *c = cosines(f, 2 * m), *d = sines(f, 2 * m);
     for (int32_t p = 0; p < m; p++) {
         real *re = b + 4 * s * p, *im = re + H;
-        turn(s, c[p], d[p], a + s * p, a + H + s * p, s * m, re, re + s, re + 2 * s, re + 3 * s, im,
-             im + s, im + 2 * s, im + 3 * s);
+        sum_fours(s, quarter, c + p, d + p, 0, a + s * p, a + H + s * p, re, re + s, re + 2 * s,
+                  re + 3 * s, im, im + s, im + 2 * s, im + 3 * s);
     }
+}
+
+/* Set b to n numbers from each of four parts in turn. */
+static void interleave(const real *restrict a, real *restrict b, int32_t n)
+{
+    for (int32_t p = 0; p < n; p++) {
+        b[4 * p] = a[p];
+        b[4 * p + 1] = a[n + p];
+        b[4 * p + 2] = a[2 * n + p];
+        b[4 * p + 3] = a[3 * n + p];
+    }
+}
+
+/* Make the first step from a to a, with one sum of each angle. Compilers use vectors for these
+ * loops. */
+static void make_first_step(const fourier *f, real *a, real *b)
+{
+    const int32_t H = f->half, m = H / 4;
+    real *im = b + H;
+    sum_fours(m, m, cosines(f, 2 * m), sines(f, 2 * m), 1, a, a + H, b, b + m, b + 2 * m, b + 3 * m,
+              im, im + m, im + 2 * m, im + 3 * m);
+    interleave(b, a, m);
+    interleave(im, a + H, m);
 }
 
 /* Transform F / 2 complex numbers, real parts first; b is as long. Return which of the two has the
@@ -83,64 +109,59 @@ static void make_step(const fourier *f, const real *restrict a, real *restrict b
 static real *transform_complex(const fourier *f, real *a, real *b)
 {
     const int32_t H = f->half;
-    int32_t s = 1;
+    int32_t s = H < 4 ? 1 : 4;
+    if (s == 4) make_first_step(f, a, b);
     for (; 4 * s <= H; s *= 4) {
-        make_step(f, a, b, H / (4 * s), s);
+        make_step(f, a, b, s);
         real *next = a;
         a = b;
         b = next;
     }
     if (s == H) return a;
-    for (int32_t q = 0; q < s; q++) { /* s is half of H */
-        b[q] = a[q] + a[q + s];
-        b[q + s] = a[q] - a[q + s];
-        b[H + q] = a[H + q] + a[H + q + s];
-        b[H + q + s] = a[H + q] - a[H + q + s];
+    for (int part = 0; part < 2; part++) { /* s is half of H */
+        const real *restrict from = a + part * H;
+        real *restrict to = b + part * H;
+        for (int32_t q = 0; q < s; q++) {
+            to[q] = from[q] + from[q + s];
+            to[q + s] = from[q] - from[q + s];
+        }
     }
     return b;
 }
 
-/* Even samples are the real parts of a transform of half the length, odd ones its imaginary parts.
- */
+/* At an odd frequency, sample k + F / 2 is turned by a quarter against sample k, and the transform
+ * of both halves is one of half the length. */
 void transform(const fourier *f, real *spectrum, const real *from, int32_t n)
 {
-    const int32_t H = f->half;
-    real *a = scratch_row(f, 0), *restrict re = spectrum, *restrict im = spectrum + f->bins;
-    for (int32_t k = 0; k < H; k++) {
-        a[k] = 2 * k < n ? from[2 * k] : 0;
-        a[H + k] = 2 * k + 1 < n ? from[2 * k + 1] : 0;
+    const int32_t H = f->half, first = n < H ? n : H, second = n - first;
+    real *restrict re = scratch_row(f, 0), *restrict im = re + H;
+    const real *restrict c = cosines(f, f->F), *restrict d = sines(f, f->F);
+    for (int32_t k = 0; k < second; k++) {
+        re[k] = from[k] * c[k] - from[H + k] * d[k];
+        im[k] = -from[k] * d[k] - from[H + k] * c[k];
     }
-    const real *restrict Z = transform_complex(f, a, scratch_row(f, 1));
-    const real *restrict c = f->turns + H, *restrict d = f->turns + f->F + H;
-    re[0] = Z[0] + Z[H];
-    re[H] = Z[0] - Z[H];
-    im[0] = im[H] = 0;
-    for (int32_t k = 1; k < H; k++) {
-        const real even = Z[k] + Z[H - k], odd = Z[H + k] + Z[2 * H - k];
-        const real even_i = Z[H + k] - Z[2 * H - k], odd_i = Z[H - k] - Z[k];
-        re[k] = (even + (odd * c[k] + odd_i * d[k])) / 2;
-        im[k] = (even_i + (odd_i * c[k] - odd * d[k])) / 2;
+    for (int32_t k = second; k < first; k++) {
+        re[k] = from[k] * c[k];
+        im[k] = -from[k] * d[k];
     }
+    for (int32_t k = first; k < H; k++) re[k] = im[k] = 0;
+    copy(spectrum, transform_complex(f, re, scratch_row(f, 1)), (size_t)f->F);
 }
 
 void transform_back(const fourier *f, real *to, const real *spectrum)
 {
     const int32_t H = f->half;
-    const real scale = 1 / (real)f->F, *restrict re = spectrum, *restrict im = spectrum + f->bins;
-    const real *restrict c = f->turns + H, *restrict d = f->turns + f->F + H;
-    real *restrict a =
-        scratch_row(f, 0); /* with the parts exchanged, the transform is the inverse */
-    a[0] = (re[0] - re[H]) * scale;
-    a[H] = (re[0] + re[H]) * scale;
-    for (int32_t k = 1; k < H; k++) {
-        const real x = re[k] - re[H - k], y = im[k] + im[H - k];
-        a[H + k] = (re[k] + re[H - k] - (x * d[k] + y * c[k])) * scale;
-        a[k] = (im[k] - im[H - k] + (x * c[k] - y * d[k])) * scale;
-    }
-    const real *Z = transform_complex(f, a, scratch_row(f, 1));
+    const real scale = 2 / (real)f->F;
+    const real *restrict c = cosines(f, f->F), *restrict d = sines(f, f->F);
+    real *restrict a = scratch_row(f, 0); /* with its parts exchanged, a transform is the inverse */
     for (int32_t k = 0; k < H; k++) {
-        to[2 * k] = Z[H + k];
-        to[2 * k + 1] = Z[k];
+        a[k] = spectrum[H + k] * scale;
+        a[H + k] = spectrum[k] * scale;
+    }
+    const real *restrict Z = transform_complex(f, a, scratch_row(f, 1));
+    for (int32_t k = 0; k < H; k++) {
+        to[k] = Z[H + k] * c[k] - Z[k] * d[k];
+        to[H + k] = -Z[H + k] * d[k] - Z[k] * c[k];
     }
 }
 
@@ -148,7 +169,7 @@ void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *
 {
     real *U = scratch_row(f, 2), *V = scratch_row(f, 3), *sums = scratch_row(f, 4);
     const int32_t part = f->F - lags + 1;
-    clear(sums, (size_t)f->spectrum);
+    clear(sums, (size_t)f->F);
     for (int32_t begin = 0; begin < n; begin += part) {
         const int32_t count = n - begin < part ? n - begin : part;
         transform(f, U, u + begin, count);
@@ -168,18 +189,18 @@ void transform_lags(const fourier *f, real *spectrum, const real *ahead, const r
     for (int32_t l = 1; l < n; l++) {
         const real share = smooth ? (real)(n - l) / (real)n : 1;
         lags[l] = ahead[l] * share;
-        lags[f->F - l] = behind[l] * share;
+        lags[f->F - l] = -behind[l] * share;
     }
     transform(f, spectrum, lags, f->F);
 }
 
 void factorise_spectra(const fourier *f, real *A, int32_t n)
 {
-    const size_t each = (size_t)f->spectrum;
+    const size_t each = (size_t)f->F;
     real *least = scratch_row(f, 2);
     for (int32_t i = 0; i < n; i++) {
         real *row = A + times(i, n) * each, *restrict diagonal = row + (size_t)i * each;
-        for (int32_t k = 0; k < f->bins; k++) least[k] = SINGULAR * diagonal[k];
+        for (int32_t k = 0; k < f->half; k++) least[k] = SINGULAR * diagonal[k];
         for (int32_t c = 0; c <= i; c++) {
             real *at = row + (size_t)c * each;
             const real *other = A + times(c, n) * each;
@@ -187,23 +208,23 @@ void factorise_spectra(const fourier *f, real *A, int32_t n)
                 add_product(f, at, other + (size_t)k * each, row + (size_t)k * each, -1, -1);
             if (c == i) continue;
             const real *restrict inverse = other + (size_t)c * each;
-            for (int32_t k = 0; k < f->bins; k++) at[k] *= inverse[k];
-            for (int32_t k = 0; k < f->bins; k++) at[f->bins + k] *= inverse[k];
+            for (int32_t k = 0; k < f->half; k++) at[k] *= inverse[k];
+            for (int32_t k = 0; k < f->half; k++) at[f->half + k] *= inverse[k];
         }
-        for (int32_t k = 0; k < f->bins; k++)
+        for (int32_t k = 0; k < f->half; k++)
             diagonal[k] = diagonal[k] > least[k] ? 1 / root(diagonal[k]) : 0;
     }
 }
 
 static void scale_spectrum(const fourier *f, real *restrict x, const real *restrict by)
 {
-    for (int32_t k = 0; k < f->bins; k++) x[k] *= by[k];
-    for (int32_t k = 0; k < f->bins; k++) x[f->bins + k] *= by[k];
+    for (int32_t k = 0; k < f->half; k++) x[k] *= by[k];
+    for (int32_t k = 0; k < f->half; k++) x[f->half + k] *= by[k];
 }
 
 void solve_spectra(const fourier *f, const real *factor, real *x, int32_t n)
 {
-    const size_t each = (size_t)f->spectrum;
+    const size_t each = (size_t)f->F;
     for (int32_t i = 0; i < n; i++) {
         for (int32_t k = 0; k < i; k++)
             add_product(f, x + (size_t)i * each, factor + (times(i, n) + (size_t)k) * each,
@@ -223,10 +244,10 @@ void solve_circulants(const fourier *f, const real *factor, real *spectra, real 
 {
     real *part = scratch_row(f, 2);
     for (int32_t i = 0; i < n; i++)
-        transform(f, spectra + times(i, f->spectrum), r + times(i, taps), taps);
+        transform(f, spectra + times(i, f->F), r + times(i, taps), taps);
     solve_spectra(f, factor, spectra, n);
     for (int32_t i = 0; i < n; i++) {
-        transform_back(f, part, spectra + times(i, f->spectrum));
+        transform_back(f, part, spectra + times(i, f->F));
         copy(to + times(i, taps), part, (size_t)taps);
     }
 }

@@ -1,21 +1,22 @@
 /* Fourier transforms of real numbers, and what can be done with them: sums of products at all lags,
  * and systems of Toeplitz equations whose lags are of both signs. F, a power of two, holds 2N of
- * them. A spectrum is F / 2 + 1 real parts, and after them as many imaginary ones. */
+ * them. The frequencies are odd: (4 j + 1) pi / F, j < F / 2, and with the conjugates all odd
+ * multiples of pi / F. A spectrum is F / 2 real parts, and after them as many imaginary ones; what
+ * products wrap around changes its sign, and circulants are skew. */
 #ifndef FOURIER_H
 #define FOURIER_H
 #include "signals.h"
 
 typedef struct {
-    int32_t F, half, bins; /* F / 2, F / 2 + 1 */
-    int32_t spectrum;      /* reals of one */
-    real *turns;           /* (2, F) cosines and sines of pi p / m at m + p */
-    real *work;            /* (5, F + 2) of a transform, and of sums at lags */
+    int32_t F, half; /* reals of a spectrum; F / 2 */
+    real *turns;     /* (2, F + F / 2) cosines and sines of pi p / m at m + p */
+    real *work;      /* (5, F) of a transform, and of sums at lags */
 } fourier;
 
 /* Return a row of the scratch memory. Transforms use the first two, sums at lags all five. */
 static inline real *scratch_row(const fourier *f, int32_t row)
 {
-    return f->work + times(row, f->F + 2);
+    return f->work + times(row, f->F);
 }
 /* Lay out transforms for the lags of N taps. */
 void layout_fourier(fourier *f, int32_t N, anc_layout *at);
@@ -38,7 +39,7 @@ void transform_lags(const fourier *f, real *spectrum, const real *ahead, const r
 static inline void add_product(const fourier *f, real *restrict to, const real *restrict a,
                                const real *restrict b, const real sign, const real turn)
 {
-    const int32_t n = f->bins;
+    const int32_t n = f->half;
     for (int32_t k = 0; k < n; k++) {
         to[k] += sign * (a[k] * b[k] - turn * a[n + k] * b[n + k]);
         to[n + k] += sign * (a[k] * b[n + k] + turn * a[n + k] * b[k]);

@@ -66,7 +66,7 @@ void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, 
     f->width = N + block;
     f->path = s->path;
     layout_fourier(&f->fourier, N, at);
-    const int32_t spectrum = f->fourier.spectrum;
+    const int32_t spectrum = f->fourier.F;
     f->numbers = structs(at, "posterior", ANC_STATE, 1, 1, 1, sizeof *f->numbers);
     f->counts = int32s(at, "posterior_counts", ANC_STATE, POSTERIOR_COUNTS);
     f->fits = int32s(at, "fits", ANC_STATE, 1);
@@ -199,8 +199,8 @@ static void leave_out(posterior *f, const real *edge, const real *T, real *out, 
                       int32_t until, real turn)
 {
     const fourier *F = &f->fourier;
-    const size_t each = (size_t)F->spectrum;
-    real *sums = f->spectra + times(f->C, F->spectrum), *rows = scratch_row(F, 2);
+    const size_t each = (size_t)F->F;
+    real *sums = f->spectra + times(f->C, F->F), *rows = scratch_row(F, 2);
     clear(sums, each);
     for (int32_t c = 0; c < f->C; c++)
         add_product(F, sums, edge + (size_t)c * each, T + (size_t)c * each, 1, -turn);
@@ -216,13 +216,13 @@ static void multiply_data(posterior *f, real *to, const real *t, real q)
 {
     const fourier *F = &f->fourier;
     const int32_t C = f->C, N = f->N;
-    const size_t each = (size_t)F->spectrum;
+    const size_t each = (size_t)F->F;
     real *T = f->spectra, *out = f->products;
     for (int32_t c = 0; c < C; c++) transform(F, T + (size_t)c * each, t + times(c, N), N);
     clear(out, (size_t)C * each);
     for (int32_t a = 0; a < C; a++)
         for (int32_t c = 0; c < C; c++)
-            add_product(F, out + (size_t)a * each, f->T_at + times(a * C + c, F->spectrum),
+            add_product(F, out + (size_t)a * each, f->T_at + times(a * C + c, F->F),
                         T + (size_t)c * each, 1, 1);
     leave_out(f, f->ahead_at, T, out, 1, N, 1);
     leave_out(f, f->before_at, T, out, 0, N - 1, -1);
@@ -259,16 +259,16 @@ static void prepare(posterior *f, real q)
     for (int32_t a = 0; a < C; a++)
         for (int32_t c = 0; c < C; c++) {
             const real *ahead = f->T + times(c * C + a, N), *behind = f->T + times(a * C + c, N);
-            real *factor = f->factor + times(a * C + c, F->spectrum);
-            transform_lags(F, f->T_at + times(a * C + c, F->spectrum), ahead, behind, N, 0);
+            real *factor = f->factor + times(a * C + c, F->F);
+            transform_lags(F, f->T_at + times(a * C + c, F->F), ahead, behind, N, 0);
             transform_lags(F, factor, ahead, behind, N, 1);
             const real ridge = a == c ? q * precision_of(f, c) : 0;
-            for (int32_t k = 0; k < F->bins; k++) factor[k] += ridge;
+            for (int32_t k = 0; k < F->half; k++) factor[k] += ridge;
         }
     factorise_spectra(F, f->factor, C);
     for (int32_t c = 0; c < C; c++) {
-        transform(F, f->ahead_at + times(c, F->spectrum), f->faded + times(c, f->B + N - 1), N);
-        transform(F, f->before_at + times(c, F->spectrum), f->before + times(c, N), N - 1);
+        transform(F, f->ahead_at + times(c, F->F), f->faded + times(c, f->B + N - 1), N);
+        transform(F, f->before_at + times(c, F->F), f->before + times(c, N), N - 1);
     }
 }
 
@@ -354,7 +354,13 @@ static int approach_posterior(posterior *f)
     const real q = mean_noise(f);
     const equations own = {f, multiply_posterior, precondition_posterior, all, f->vectors};
     prepare(f, q);
-    for (int32_t row = 0; row < f->rows; row++) {
+    const int32_t draws = f->rows - f->K;
+    for (int32_t i = 0; i < f->K + draws; i++) {
+        /* Draws take turns, such that each is solved again before a part of the data in as many as
+         * there are draws is new. */
+        const int last = (real)(i - f->K) * f->numbers->samples >= (real)(DRAWS * f->B);
+        if (last && !f->counts[FRESH]) break;
+        const int32_t row = i < f->K ? i : f->K + (f->counts[TURN] = (f->counts[TURN] + 1) % draws);
         set_right(f, row, q, f->counts[FRESH]);
         approach(&own, f->right, taps_of(f, f->solution, row, 0), PLANT_STEPS,
                  ENOUGH * (row < f->K ? q : 1) * (real)f->n);
@@ -363,8 +369,8 @@ static int approach_posterior(posterior *f)
     copy(f->q, f->next_q, (size_t)f->K);
     /* Draws are over sqrt(q). If q rises, they keep their size, until they are solved with it. */
     const real scale = smaller(root(q / mean_noise(f)), 1);
-    real *draws = taps_of(f, f->solution, f->K, 0);
-    for (int32_t i = 0; scale < 1 && i < (f->rows - f->K) * all; i++) draws[i] *= scale;
+    real *unit = taps_of(f, f->solution, f->K, 0);
+    for (int32_t i = 0; scale < 1 && i < draws * all; i++) unit[i] *= scale;
     keep_significant(f);
     set_theta(f);
     count_up(f->fits);

@@ -1,112 +1,170 @@
-"""Print what each rule of KF-PB's price is worth, with the oracle: ``python tests/helpers/budget_ablation.py``.
+"""Print what breaks without each constant of KF-PB: ``python tests/helpers/budget_ablation.py [constant ...]``.
 
-It takes about an hour.
+In a copy of the package, a constant of the C core gets a value that makes it do nothing. Then KF-PB runs through the events
+and ten noises of its studies, and with three loudspeakers.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import pickle
+import re
+import shutil
+import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
+ROOT = Path(__file__).resolve().parents[2]
+if __name__ == "__main__" and "PYTHONPATH" not in os.environ:
+    sys.path.insert(0, str(ROOT))
 
-from oracles import power_budget as law  # noqa: E402
-
+from comparisons.studies import events  # noqa: E402
 from comparisons.studies import kf_pb_cases as study  # noqa: E402
-from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S  # noqa: E402
+from kfopc_filterpy import Plant, kf_pb, noise_reduction_db, simulate  # noqa: E402
 from kfopc_filterpy.metrics import overshoot  # noqa: E402
 
+WITHOUT = {  # the value with which a constant does nothing
+    "CHEAPER": "0",
+    "CHEAPEST": "0",
+    "WORTHWHILE": "0",
+    "LEAST_SHARE": "0",
+    "PLANNED": "1",
+    "MOST": "1e9",
+    "WINDOW_LASTS": "20",  # no longer than the block's power
+    "BLOCK_LASTS": "4",  # as long as the window's power
+    "SHORTER": "1",
+    "GROWTH": "1e30",
+    "FILTER_STEPS": "1",
+    "PRICE_STEPS": "1",
+    "PRICE_RISES": "1e9",
+    "DRAWS": "2",
+    "LOUDER": "1e30",
+    "SURPRISE": "1e9",
+    "REDRAWN": "0.1",  # what is known before a surprise
+    "FOREIGN": "1e9",
+    "FADES": "0",
+    "EIGHTHS": "1",
+    "PLANT_STEPS": "1",
+    "ENOUGH": "0",
+}
 CASES = (
-    ("duct", "compressor"),
-    ("duct", "bursts"),
+    *(("duct", noise) for noise in ("compressor", "bursts", "swelling band noise", "recorded motor")),
+    *(("measured duct", noise) for noise in ("compressor", "recorded motor")),
     ("duct", "compressor, 12 dB louder from 8 s on"),
     ("band-pass", "compressor, 10 dB louder for 4 s"),
+    ("band-pass", "compressor, 12 dB softer from 8 s on"),
     ("band-pass", "band noise, then compressor"),
 )
 
 
-def run(case: study.Rated, **settings: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the error and the control signal after switch-on, computed in blocks."""
-    own = law.PowerBudget(
-        s_hat=case.secondary[np.newaxis, np.newaxis],
-        n_taps=study.N_TAPS,
-        rated_power=np.array([case.rated_power]),
-        fs=study.FS,
-        **settings,
-    )
-    B, on = own.B, round(study.SILENT_S * study.FS)
-    taps = case.secondary.size
-    x, d = case.reference, case.disturbance
-    y, e = np.zeros(x.size + taps), d.copy()  # y is delayed by `taps` samples
-    ends = range(B, x.size + 1, B)
-    for b in ends:
-        a = b - B
-        sounds = a >= on
-        if sounds:
-            past = np.concatenate([own.x_past[0], x[a:b]])
-            y[taps + a : taps + b] = np.convolve(past, own.w[0, 0])[: past.size][-B:]
-            e[a:b] -= np.convolve(y[a + 1 : taps + b], case.secondary, "valid")
-            own.asked = list(y[taps + a : taps + b, np.newaxis] ** 2)
-        own.end_block(x[np.newaxis, a:b], y[np.newaxis, taps + a : taps + b], e[np.newaxis, a:b])
-    return e[on:], y[taps + on :]
-
-
-@contextmanager
-def without(rule: str) -> Iterator[dict[str, float]]:
-    """Switch a rule off; the settings of the controller that this takes."""
-    kept, share = vars(law.core).copy(), law.PowerBudget.share
-    windows = law.WINDOW_S, law.WINDOWS
-    settings = {"spread": 0.0}
-    if rule == "account":
-        law.core.CHEAPER = 0.0
-    elif rule == "floor":
-        law.core.WORTHWHILE = 0.0
-    elif rule == "the shorter window":
-        law.WINDOW_S, law.WINDOWS = 10.0, 1
-    elif rule == "the level":
-        law.core.SHORTER = 1
-    elif rule == "what the account stands":
-        law.PowerBudget.share = lambda self, v, _: np.ones(len(v))
-    elif rule == "with the path verified":
-        settings = {}
-    try:
-        yield settings
-    finally:
-        law.PowerBudget.share = share
-        law.WINDOW_S, law.WINDOWS = windows
-        vars(law.core).update(kept)
-
-
-def main() -> None:
-    """Print a line for each rule."""
+def cases() -> list[tuple[str, study.Rated]]:
+    """Return the noises whose recordings are at hand, at a quarter of the power that full control needs."""
     plants, made = study.all_plants(), study.noises()
-    cases = [study.make_rated(plants[path], made[noise][1](), study.SHARES[0]) for path, noise in CASES]
-    rules = (
-        "nothing",
-        "the level",
-        "account",
-        "floor",
-        "the shorter window",
-        "what the account stands",
-        "with the path verified",
+    usable = [(path, noise) for path, noise in CASES if path in plants and noise in made]
+    return [
+        (f"{noise} ({path})", study.make_rated(plants[path], made[noise][1](), study.SHARES[0]))
+        for path, noise in usable
+    ]
+
+
+def three_loudspeakers() -> tuple[float, float]:
+    """Return the noise reduction from the second second on, and the largest power over the rating."""
+    rng, fs, taps, n = np.random.default_rng(0), 16000, 64, 6 * 16000
+    s = rng.standard_normal((3, 3, taps)) * np.exp(-np.arange(taps) / 15) * (np.arange(taps) >= 5)
+    x = np.convolve(rng.standard_normal(n), [1, 1.6, 0.9, 0, -0.4])[:n]
+    p = rng.standard_normal((3, taps)) * np.exp(-np.arange(taps) / 30) * (np.arange(taps) >= 20)
+    d = np.array([np.convolve(x, path)[:n] for path in p])
+    rated = 0.02 * np.mean(d**2) * np.array([1.0, 2.0, 0.5])
+    run = simulate(kf_pb(128, s, rated_power=rated, fs=fs), x, Plant(s, fs=fs), disturbance=d)
+    power = np.mean(run.control_signal[:, n // 3 :] ** 2, axis=1) / rated
+    return noise_reduction_db(run.error[:, fs:], d[:, fs:], steady=1.0), float(np.max(power))
+
+
+def measure(made: Path) -> dict[str, Any]:
+    """Return the figures of all runs."""
+    rows = [events.event_row(name) for name in events.EVENTS]
+    of_events = {row.event: (row.lost_db[1:], row.loudest_tenth_db, row.power, row.alarms) for row in rows}
+    of_cases = {}
+    for name, case in pickle.loads(made.read_bytes()):
+        controller = case.kf_pb(case.secondary)
+        run = case.run(controller)
+        power = overshoot(run.control_signal, case.rated_power, study.FS, window_s=10.0)
+        of_cases[name] = case.reduction_db(run.error), power, int(controller.alarms)
+    of_cases["three loudspeakers"] = *three_loudspeakers(), 0
+    return {"events": of_events, "cases": of_cases}
+
+
+def measured_without(constant: str, folder: Path, made: Path) -> dict[str, Any]:
+    """Return the figures of a package in which a constant does nothing."""
+    tree = folder / (constant or "as it is")
+    ignored = shutil.ignore_patterns("libanc-*", "__pycache__")
+    for package in ("kfopc_filterpy", "comparisons"):
+        shutil.copytree(ROOT / package, tree / package, ignore=ignored)
+    core = tree / "kfopc_filterpy" / "core"
+    for path in core.glob("*.[ch]"):
+        text = path.read_text()
+        changed = re.sub(rf"\b{constant} = [^,; ]+", f"{constant} = {WITHOUT.get(constant)}", text) if constant else text
+        path.write_text(changed)
+    command = [sys.executable, "-c", BUILD, str(core)]
+    subprocess.run(command, check=True)
+    environment = os.environ | {"PYTHONPATH": str(tree), "KFOPC_CORE_LEVEL": "baseline"}
+    run = subprocess.run(
+        [sys.executable, __file__, "measure", str(made)], env=environment, check=True, capture_output=True, text=True
     )
-    print(f"{'without':26}{'over the bound, mean':>22}{'worst dB':>10}{'power over 10 s, most':>24}")
-    with tqdm(total=len(rules) * len(cases)) as bar:
-        for rule in rules:
-            gains, powers = [], []
-            for case in cases:
-                with without(rule) as settings:
-                    e, y = run(case, **settings)
-                gains.append(case.reduction_db(e) - case.reduction_db(case.bound_error))
-                powers.append(overshoot(y, case.rated_power, study.FS, window_s=DEFAULT_AVERAGING_S))
-                bar.update()
-            bar.write(f"{rule:26}{np.mean(gains):+22.2f}{min(gains):+10.2f}{max(powers):24.2f}", file=sys.stdout)
+    found: dict[str, Any] = json.loads(run.stdout)
+    return found
+
+
+# In a process of its own: the copy's builder names the copy's sources.
+BUILD = """
+import importlib.util, pathlib, sys
+core = pathlib.Path(sys.argv[1])
+spec = importlib.util.spec_from_file_location("building", core / "building.py")
+own = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(own)
+own.build(own.core_sources(), core / own.library_name("double", own.LEVELS[0]))
+"""
+
+
+def line(constant: str, own: dict[str, Any], usual: dict[str, Any]) -> str:
+    """Return a row of the table: the most that is lost against the law as it is, and where."""
+    lost = {
+        name: max(np.subtract(row[0], usual["events"][name][0])) for name, row in own["events"].items()
+    }
+    gained = {name: row[0] - usual["cases"][name][0] for name, row in own["cases"].items()}
+    event, case = max(lost, key=lambda name: lost[name]), min(gained, key=lambda name: gained[name])
+    tenth = max(row[1] for row in own["events"].values())
+    power = max(row[2] for row in own["events"].values()), max(row[1] for row in own["cases"].values())
+    alarms = sum(row[3] for row in own["events"].values()), sum(row[2] for row in own["cases"].values())
+    return (
+        f"{constant or 'nothing':13}{lost[event]:6.1f} {event:35}{tenth:6.1f}{power[0]:7.3f}{alarms[0]:4}"
+        f"{np.mean(list(gained.values())):+7.2f}{gained[case]:+7.2f} {case:44}{power[1]:6.3f}{alarms[1]:4}"
+    )
+
+
+def main(*names: str) -> None:
+    """Print a line for each constant."""
+    constants = names or tuple(WITHOUT)
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as pool:
+        made = Path(folder, "cases.pkl")
+        made.write_bytes(pickle.dumps(cases()))
+        measured = pool.map(partial(measured_without, folder=Path(folder), made=made), ("", *constants))
+        usual: dict[str, Any] = {}
+        for constant, own in tqdm(zip(("", *constants), measured, strict=True), total=1 + len(constants), disable=None):
+            usual = usual or own
+            tqdm.write(line(constant, own, usual), file=sys.stdout)
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == ["measure"]:
+        print(json.dumps(measure(Path(sys.argv[2]))))
+    else:
+        main(*sys.argv[1:])

@@ -66,10 +66,12 @@ def toeplitz(R, n):
 
 
 def preconditioner(R, n):
-    """Return the inverse, cut to n taps, of the circulant nearest to the Toeplitz matrix of n lags: it is definite, too."""
-    lag = np.minimum(np.arange(R.shape[2]), R.shape[2] - np.arange(R.shape[2]))
-    spectra = np.fft.rfft(R * np.maximum(1 - lag / n, 0))
-    return toeplitz(np.fft.irfft(np.linalg.inv(spectra.T).T), n)
+    """Return the inverse, cut to n taps, of a skew-circulant near to the Toeplitz matrix of n lags: it is definite, too."""
+    F, order = R.shape[2], np.arange(R.shape[2])
+    lag = np.where(order < F / 2, order, order - F)
+    turn = np.exp(-1j * np.pi * lag / F)  # to the odd frequencies
+    spectra = np.fft.fft(R * np.maximum(1 - abs(lag) / n, 0) * turn)
+    return toeplitz((np.fft.ifft(np.linalg.inv(spectra.T).T) / turn).real, n)
 
 
 def conjugate_gradients(A, W, b, v, steps, enough=0.0):
@@ -80,7 +82,8 @@ def conjugate_gradients(A, W, b, v, steps, enough=0.0):
     for _ in range(steps):
         goes_on, nothing = rz > enough, np.zeros_like(rz)
         Ap = p @ A
-        a = np.divide(rz, np.sum(p * Ap, axis=-1, keepdims=True), where=goes_on, out=nothing.copy())
+        bend = np.sum(p * Ap, axis=-1, keepdims=True)
+        a = np.divide(rz, bend, where=goes_on & (bend > 0), out=nothing.copy())
         v, r = v + a * p, r - a * Ap
         z, before = r @ W, rz
         rz = np.sum(r * z, axis=-1, keepdims=True)
@@ -108,7 +111,7 @@ class Plant:
         self.theta = np.concatenate([self.mean, 0 * self.unit])
         self.q, self.significant, self.precision = np.zeros(self.K), 1.0, np.zeros(self.mask.size)
         self.begun = self.waiting = self.silent = False  # waiting: no fit of a whole block since a surprise
-        self.fits = self.surprises = 0
+        self.fits = self.surprises = self.turn = 0
         self.missed = self.expected = self.loud = self.taught = 0.0
 
     def signs(self, rows, n):
@@ -225,7 +228,12 @@ class Plant:
         W = preconditioner(R, N) * np.outer(weight, weight)
         enough = core.ENOUGH * self.n * np.repeat([q, 1.0], [K, core.DRAWS])[:, None]
         A = self.G + np.diag(ridge)
-        self.theta = conjugate_gradients(A, W, self.r + pull, self.theta, core.PLANT_STEPS, enough)
+        due = core.DRAWS if self.fresh else min(math.ceil(core.DRAWS * self.B / self.count), core.DRAWS)
+        turns = (self.turn + 1 + np.arange(due)) % core.DRAWS
+        solved = np.concatenate([np.arange(K), K + turns])  # not all draws: they change little
+        pull, theta = (self.r + pull)[solved], self.theta[solved]
+        self.theta[solved] = conjugate_gradients(A, W, pull, theta, core.PLANT_STEPS, enough[solved])
+        self.turn = (self.turn + due) % core.DRAWS
         theta = self.theta[:K]
         residual = np.maximum(self.ee + np.sum(theta * (theta @ self.G - 2 * self.r[:K]), axis=1), 0.0)
         # The noise, with the earlier estimate counting as n samples: a short record leaves little noise by chance.
