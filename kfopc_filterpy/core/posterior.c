@@ -346,31 +346,36 @@ static real energy_of_control(const posterior *f)
     return energy;
 }
 
+/* Approach the solution of a row. */
+static void solve_row(posterior *f, int32_t row, real q)
+{
+    const equations own = {f, multiply_posterior, precondition_posterior, f->C * f->N, f->vectors};
+    set_right(f, row, q, f->counts[FRESH]);
+    approach(&own, f->right, taps_of(f, f->solution, row, 0), PLANT_STEPS,
+             ENOUGH * (row < f->K ? q : 1) * (real)f->n);
+}
+
 /* Approach the posterior of the data; return 0 if nothing can be told yet. */
 static int approach_posterior(posterior *f)
 {
-    const int32_t all = f->C * f->N;
     if (!set_prior(f)) return 0;
-    const real q = mean_noise(f);
-    const equations own = {f, multiply_posterior, precondition_posterior, all, f->vectors};
-    prepare(f, q);
     const int32_t draws = f->rows - f->K;
-    for (int32_t i = 0; i < f->K + draws; i++) {
-        /* Draws take turns, such that each is solved again before a part of the data in as many as
-         * there are draws is new. */
-        const int last = (real)(i - f->K) * f->numbers->samples >= (real)(DRAWS * f->B);
-        if (last && !f->counts[FRESH]) break;
-        const int32_t row = i < f->K ? i : f->K + (f->counts[TURN] = (f->counts[TURN] + 1) % draws);
-        set_right(f, row, q, f->counts[FRESH]);
-        approach(&own, f->right, taps_of(f, f->solution, row, 0), PLANT_STEPS,
-                 ENOUGH * (row < f->K ? q : 1) * (real)f->n);
-        if (row < f->K) f->next_q[row] = noise_of(f, row, q, f->vectors);
+    const real q = mean_noise(f), renewed = (real)(f->B * draws) / f->numbers->samples;
+    prepare(f, q);
+    for (int32_t k = 0; k < f->K; k++) {
+        solve_row(f, k, q);
+        f->next_q[k] = noise_of(f, k, q, f->vectors);
+    }
+    /* Draws take turns: each is solved again before a share of the data, of 1 / draws, is new. */
+    for (int32_t i = 0; i < draws && (f->counts[FRESH] || (real)i < renewed); i++) {
+        solve_row(f, f->K + f->counts[TURN], q);
+        f->counts[TURN] = (f->counts[TURN] + 1) % draws;
     }
     copy(f->q, f->next_q, (size_t)f->K);
     /* Draws are over sqrt(q). If q rises, they keep their size, until they are solved with it. */
     const real scale = smaller(root(q / mean_noise(f)), 1);
     real *unit = taps_of(f, f->solution, f->K, 0);
-    for (int32_t i = 0; scale < 1 && i < draws * all; i++) unit[i] *= scale;
+    for (int32_t i = 0; scale < 1 && i < draws * f->C * f->N; i++) unit[i] *= scale;
     keep_significant(f);
     set_theta(f);
     count_up(f->fits);

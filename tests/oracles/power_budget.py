@@ -229,7 +229,7 @@ class Plant:
         enough = core.ENOUGH * self.n * np.repeat([q, 1.0], [K, core.DRAWS])[:, None]
         A = self.G + np.diag(ridge)
         due = core.DRAWS if self.fresh else min(math.ceil(core.DRAWS * self.B / self.count), core.DRAWS)
-        turns = (self.turn + 1 + np.arange(due)) % core.DRAWS
+        turns = (self.turn + np.arange(due)) % core.DRAWS
         solved = np.concatenate([np.arange(K), K + turns])  # not all draws: they change little
         pull, theta = (self.r + pull)[solved], self.theta[solved]
         self.theta[solved] = conjugate_gradients(A, W, pull, theta, core.PLANT_STEPS, enough[solved])
