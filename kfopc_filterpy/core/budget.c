@@ -8,8 +8,8 @@
  * filters of all loudspeakers become those of least expected error at the prices of their powers,
  * (A + price R) v = b: A is the correlation of the filtered references, R that of the references, b
  * theirs with the disturbance. Both are Toeplitz for each pair of filters. A few steps of conjugate
- * gradients from the last solution approach the filters, and two steps of Newton's method the
- * prices. N = L + M - 1 taps of a primary path are all that control can reach. */
+ * gradients from the last solution approach the filters, and a step of Newton's method the prices.
+ * N = L + M - 1 taps of a primary path are all that control can reach. */
 #include "posterior.h"
 
 enum { RATED_POWER, BLOCK, AVERAGING, WINDOW, MEMORY, SPREAD };
@@ -21,17 +21,11 @@ static const anc_setting budget_settings[] = {{"rated_power", 1e-30f, 0, ANC_EAC
                                               {"spread", 0, 1000, ANC_ONE},
                                               {0}};
 
-/* What is left of the account makes power cheaper by this many times its share, so that steady
- * noises spend all of it; at the cheapest, the price is this part of itself, so that a noise that
- * has become loud does not spend at once what it needs for long. */
-static const real CHEAPER = 4, CHEAPEST = (real)0.7;
-/* A rating of power must save at least this share of the noise. */
-static const real WORTHWHILE = 0.5f;
-/* Shares of the account: what a filter may always spend; what is planned, a little more than all,
- * since a noise that fluctuates spends less; what is never exceeded, but clipped. */
-static const real LEAST_SHARE = (real)0.02, PLANNED = (real)1.02, MOST = (real)1.04;
-/* The account must afford the power of the last window of x for this part of the averaging time,
- * and that of the last block for this one. */
+/* Shares of the account: what is planned for a short time, a little more than all, since a noise
+ * that fluctuates spends less; what is never exceeded, but clipped. */
+static const real PLANNED = (real)1.02, MOST = (real)1.04;
+/* A noise may go on as in the window of x for this part of the averaging time, and as in the last
+ * block for this one. */
 enum { WINDOW_LASTS = 4, BLOCK_LASTS = 20 };
 /* The level of x is that of an exponential window which is so much shorter than that of its
  * spectrum: a spectrum needs many samples, a level few. */
@@ -39,10 +33,8 @@ enum { SHORTER = 5 };
 /* A sound does not grow by more than this from one sample to the next, but a click in a reference
  * does. */
 static const real GROWTH = 10;
-/* Steps of conjugate gradients towards filters, and of the prices, in a block. */
-enum { FILTER_STEPS = 6, PRICE_STEPS = 2 };
-/* A price rises by at most so many times itself in a step. */
-static const real PRICE_RISES = 3;
+/* Steps of conjugate gradients towards filters. */
+enum { FILTER_STEPS = 6 };
 /* No filter has a larger tap. REGULAR: share of the powers of x that is added to them, and of the
  * paths' gains that is added to the prices, so that rounding leaves the matrix definite. */
 #ifdef ANC_FLOAT
@@ -61,8 +53,8 @@ typedef struct {
     real *R, *short_R;        /* (I, I, N) windowed sums of x_i(t) x_a(t - l) */
     real *weight;             /* (2) of these windows */
     real *book;               /* (T, J) power of each block over the rating, newest first */
-    real *price, *steady;     /* (J); (J) the price that spends the rating */
-    real *now, *at_steady;    /* (J, I, L) filters at these prices */
+    real *price;              /* (J) */
+    real *now;                /* (J, I, L) filters at these prices */
     real *lags;               /* (I, I, N) of the windows, into which the newest block fades in */
     real *R_at, *smooth_R;    /* (I, I) spectra: of the lags, of the circulant nearest to them */
     real *short_at;           /* (I, I) spectra: of the short window */
@@ -71,8 +63,7 @@ typedef struct {
     real *b;                  /* (J, I, L) */
     real *spectra, *products; /* (J, I), (J, I) spectra */
     real *vectors;            /* (5, J, I, L) */
-    real *small;              /* (J + 8, J) see `next_prices` */
-    const real *priced;       /* (J) prices of the equations that are solved */
+    real *small;              /* (J + 5, J) see `solve_all` */
     real *window;             /* (I, B + N - 1) */
     real *work;               /* (2, width) */
     int32_t width;
@@ -120,9 +111,7 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     f->weight = reals(at, "window_weights", ANC_STATE, 1, 1, 1, 2);
     f->book = reals(at, "book", ANC_STATE, 1, 1, f->T, J);
     f->price = reals(at, "price", ANC_STATE, 1, 1, 1, J);
-    f->steady = reals(at, "steady_price", ANC_STATE, 1, 1, 1, J);
     f->now = reals(at, "filters", ANC_STATE, 1, J, I, L);
-    f->at_steady = reals(at, "steady_filters", ANC_STATE, 1, J, I, L);
     f->lags = reals(at, "lags", ANC_SCRATCH, 1, I, I, N);
     f->R_at = reals(at, "reference_spectra", ANC_SCRATCH, 1, I, I, spectrum);
     f->smooth_R = reals(at, "smooth_reference_spectra", ANC_SCRATCH, 1, I, I, spectrum);
@@ -135,7 +124,7 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     f->spectra = reals(at, "filter_spectra", ANC_SCRATCH, 1, J, I, spectrum);
     f->products = reals(at, "filter_products", ANC_SCRATCH, 1, J, I, spectrum);
     f->vectors = reals(at, "filter_vectors", ANC_SCRATCH, 5, J, I, L);
-    f->small = reals(at, "dual", ANC_SCRATCH, 1, 1, J + 8, J);
+    f->small = reals(at, "dual", ANC_SCRATCH, 1, 1, J + 5, J);
     f->window = reals(at, "windowed", ANC_SCRATCH, 1, 1, I, B + N - 1);
     f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, 2, f->width);
 }
@@ -342,7 +331,7 @@ static void multiply_filters(void *self, real *to, const real *v)
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++) {
             const real *own = f->products + times(j * I + i, F->F);
-            const real price = f->priced[j] + REGULAR * f->gain[j];
+            const real price = f->price[j] + REGULAR * f->gain[j];
             for (size_t k = 0; k < each; k++) sums[k] = price * own[k];
             for (int32_t a = 0; a < J; a++)
                 add_product(F, sums, f->SS + times(j * J + a, F->F),
@@ -358,25 +347,24 @@ static void precondition_filters(void *self, real *to, const real *r)
     solve_circulants(&f->posterior.fourier, f->factor, f->spectra, to, r, f->s.J * f->s.I, f->s.L);
 }
 
-/* Go some steps from the filters v towards those at the prices. */
-static void solve_at(budget *f, const real *prices, real *v)
+/* Go some steps from the last filters towards those at the prices. */
+static void solve_filters(budget *f)
 {
     const int32_t I = f->s.I, J = f->s.J, n = all_taps(f);
     const fourier *F = &f->posterior.fourier;
     const equations own = {f, multiply_filters, precondition_filters, n, f->vectors};
-    f->priced = prices;
     copy(f->factor, f->smooth_A, times(J * I * J * I, F->F));
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++)
             for (int32_t c = 0; c <= i; c++)
                 add_scaled(f->factor + times((j * I + i) * J * I + j * I + c, F->F),
-                           prices[j] + REGULAR * f->gain[j], f->smooth_R + times(i * I + c, F->F),
+                           f->price[j] + REGULAR * f->gain[j], f->smooth_R + times(i * I + c, F->F),
                            F->F);
     factorise_spectra(F, f->factor, J * I);
-    approach(&own, f->b, v, FILTER_STEPS, 0);
+    approach(&own, f->b, f->now, FILTER_STEPS, 0);
     for (int32_t i = 0; i < n; i++)
-        if (!within(v[i], LARGEST_TAP)) {
-            clear(v, (size_t)n);
+        if (!within(f->now[i], LARGEST_TAP)) {
+            clear(f->now, (size_t)n);
             return;
         }
 }
@@ -401,14 +389,20 @@ static void solve_small(real *H, real *x, int32_t J)
     }
 }
 
-/* Set H_ja = u_j'A^-1 u_a, u_j = R v_j, with the preconditioner in place of A, and the powers. */
-static void set_slopes(budget *f, const real *v, real *H, real *power)
+/* Set the powers of the filters; u_j = R v_j are left in the vectors. */
+static void set_powers(budget *f, real *power)
+{
+    for (int32_t j = 0; j < f->s.J; j++)
+        power[j] = power_of(f, f->R_at, f->now, j, f->vectors + times(j, f->s.I * f->s.L));
+}
+
+/* Set H_ja = u_j'A^-1 u_a, with the preconditioner in place of A. */
+static void set_slopes(budget *f, real *H)
 {
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
     const size_t each = (size_t)F->F;
-    real *u = f->vectors;
-    for (int32_t j = 0; j < J; j++) power[j] = power_of(f, f->R_at, v, j, u + times(j, I * L));
+    const real *u = f->vectors;
     for (int32_t ji = 0; ji < J * I; ji++)
         transform(F, f->products + (size_t)ji * each, u + times(ji, L), L);
     for (int32_t a = 0; a < J; a++) {
@@ -428,12 +422,12 @@ static void set_slopes(budget *f, const real *v, real *H, real *power)
 
 /* Make a step of Newton's method with the prices, of which power^-1/2 is nearly a line, with the
  * slope power^-3/2 u'A^-1 u. */
-static void next_prices(budget *f, real *price, const real *v, const real *target)
+static void next_prices(budget *f, const real *power, const real *target)
 {
     const int32_t J = f->s.J;
-    real *H = f->small, *power = H + times(J, J), *size = power + J, *step = size + J;
-    real *factor = f->factor, gain = 0;
-    set_slopes(f, v, H, power);
+    real *H = f->small, *size = H + times(J, J), *step = size + J;
+    real *factor = f->factor, *price = f->price, gain = 0;
+    set_slopes(f, H);
     for (int32_t j = 0; j < J; j++) {
         const int free = price[j] > 0 || power[j] > target[j];
         size[j] = free ? 1 / root(larger(H[j * J + j], LEAST_POWER)) : 0;
@@ -453,8 +447,7 @@ static void next_prices(budget *f, real *price, const real *v, const real *targe
         }
     }
     for (int32_t j = 0; j < J; j++) {
-        const real most = larger(PRICE_RISES * price[j], (real)1e-3 * f->gain[j]);
-        price[j] += smaller(larger(step[j], -price[j]), most);
+        price[j] += larger(step[j], -price[j]);
         if (price[j] < (real)1e-9 * f->gain[j]) price[j] = 0;
     }
 }
@@ -474,85 +467,60 @@ static real power_of_block(const budget *f, const real *v)
     return dot(y, y, B) / (real)B;
 }
 
-/* Return the largest factor on the power of filter v that loudspeaker j's account can afford, if
- * the noise goes on: that of the last block for a short time, and that of the window of x, for
- * which v takes `power`, for longer. If `later` is not 0, the rating must last for `later` times
- * this power for even longer: otherwise what a silence has saved would be spent at once, and be
- * missing later. */
-static real affordable(const budget *f, int32_t j, const real *v, real power, real later)
+/* Return the power that loudspeaker j's account can afford, if the noise goes on: as in the last
+ * block, where its filter has another power, for a short time; as in the window of x, for longer;
+ * and then at the level of now. So what a silence has saved is spent evenly. */
+static real affordable(const budget *f, int32_t j, real power, real level)
 {
     const int32_t T = f->T, block = T / BLOCK_LASTS, window = T / WINDOW_LASTS;
-    const real rated = f->s.setting[RATED_POWER][j], of_block = power_of_block(f, v);
-    real spent = 0, factor = 0;
+    const real of_block = power_of_block(f, f->now + times(j, f->s.I * f->s.L));
+    real spent = 0, least = 0;
     for (int32_t n = T - 1; n >= block; n--) { /* spent, and still counted n blocks from now */
         spent += f->book[times(T - 1 - n, f->s.J) + (size_t)j];
-        const int longer = later > 0 && n > window && n <= T - block;
-        if (!longer && n != window && n != block) continue;
-        const real planned = (longer ? 1 : PLANNED) * (real)T;
-        const real left = larger(planned - spent, LEAST_SHARE * (real)n);
-        const real expected = longer ? later * power : n == window ? power : of_block;
-        const real afforded = left / (real)n * rated / larger(expected, LEAST_POWER);
-        if (factor == 0 || afforded < factor) factor = afforded;
+        const int longer = n > window && n <= T - block;
+        if (!longer && n != window && (n != block || !(of_block > 0 && power > 0))) continue;
+        const real left = (longer ? 1 : PLANNED) * (real)T - spent;
+        const real each = larger(left / (real)n, PLANNED - 1) * f->s.setting[RATED_POWER][j];
+        const real afforded = each * (longer ? 1 / level : n == window ? 1 : power / of_block);
+        if (least == 0 || afforded < least) least = afforded;
     }
-    return factor;
+    return least;
 }
 
-/* Set the shares of their powers that the filters may have, and these powers. Return whether the
- * account of a loudspeaker refuses some. */
-static int set_shares(budget *f, const real *later, real *share, real *power)
+/* Set the levels of x, of now over the usual ones, as the last filters tell them; at most 1. */
+static void set_levels(budget *f, real *level)
 {
-    int refused = 0;
     for (int32_t j = 0; j < f->s.J; j++) {
-        const real *v = f->now + times(j, f->s.I * f->s.L);
-        power[j] = power_of(f, f->R_at, f->now, j, f->vectors);
-        share[j] = smaller(affordable(f, j, v, power[j], later[j]), 1);
-        power[j] *= share[j];
-        refused |= share[j] < 1;
+        const real usual = power_of(f, f->R_at, f->s.weights, j, f->vectors);
+        const real now = power_of(f, f->short_at, f->s.weights, j, f->vectors);
+        level[j] = usual > 0 && now > 0 ? smaller(now / usual, 1) : 1;
     }
-    return refused;
 }
 
-/* Set the prices, and the filters of least expected error at these prices. */
+/* Set the filters of least expected error at the prices, their powers, and those that the accounts
+ * afford. */
+static void solve_at_prices(budget *f, const real *level, real *power, real *afforded)
+{
+    solve_filters(f);
+    set_powers(f, power);
+    for (int32_t j = 0; j < f->s.J; j++) afforded[j] = affordable(f, j, power[j], level[j]);
+}
+
+/* Set the prices at which the accounts afford the filters. What a step leaves is taken off. */
 static void solve_all(budget *f)
 {
     const int32_t J = f->s.J, n = f->s.I * f->s.L;
-    real *later = f->small + times(J + 4, J), *target = later + J, *share = target + J, q = 0;
+    real *level = f->small + times(J + 2, J), *power = level + J, *afforded = power + J;
     set_equations(f);
-    /* 1 The prices at which the filters spend the rating, for the spectrum of the window of x and
-     * the level of the shorter one, which the last filters tell. */
+    set_levels(f, level);
+    solve_at_prices(f, level, power, afforded);
+    next_prices(f, power, afforded);
+    solve_at_prices(f, level, power, afforded);
     for (int32_t j = 0; j < J; j++) {
-        const real *last = f->s.weights;
-        const real usual = power_of(f, f->R_at, last, j, f->vectors);
-        const real now = power_of(f, f->short_at, last, j, f->vectors);
-        const real level = usual > 0 && now > 0 ? now / usual : 1;
-        target[j] = f->s.setting[RATED_POWER][j] / level;
-        later[j] = smaller(level, 1);
-    }
-    for (int step = 0; step < PRICE_STEPS; step++) {
-        solve_at(f, f->steady, f->at_steady);
-        next_prices(f, f->steady, f->at_steady, target);
-    }
-    /* 2 What the account holds makes power cheaper, but none that saves little of the noise. */
-    for (int32_t k = 0; k < f->s.K; k++) q += f->posterior.q[k];
-    for (int32_t j = 0; j < J; j++) {
-        const real left = larger(1 - spent_by(f, j, f->T) / (real)f->T, 0);
-        const real cheaper = larger(1 - CHEAPER * left, CHEAPEST);
-        /* A silence has left more than the price follows: else it would be spent at once, and be
-         * missing later. */
-        if (CHEAPER * left <= 1 - CHEAPEST) later[j] = 0;
-        const real least = WORTHWHILE * q / (f->s.setting[RATED_POWER][j] * (real)J);
-        f->price[j] = larger(f->steady[j] * cheaper, least);
-    }
-    solve_at(f, f->price, f->now);
-    /* 3 The account must afford it: by the price, and what is left is taken off. */
-    if (set_shares(f, later, share, target)) {
-        next_prices(f, f->price, f->now, target);
-        solve_at(f, f->price, f->now);
-        set_shares(f, later, share, target);
-    }
-    for (int32_t j = 0; j < J; j++)
+        const real share = power[j] > afforded[j] ? root(afforded[j] / power[j]) : 1;
         for (int32_t i = 0; i < n; i++)
-            weights_of(&f->s, j)[i] = root(share[j]) * f->now[times(j, n) + (size_t)i];
+            weights_of(&f->s, j)[i] = share * f->now[times(j, n) + (size_t)i];
+    }
 }
 
 /* A sample. */

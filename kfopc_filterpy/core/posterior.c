@@ -6,14 +6,6 @@
 static const real SURPRISE = 10;
 /* rms error over the path, if it gave way to an independent one of the same size: sqrt(2). */
 static const real REDRAWN = (real)1.4142135623730951;
-/* A noise so far beyond the disturbance that x foretells, which is so far below the usual one, has
- * no part of x: a plant of the same size leaves an error of up to four times the disturbance. */
-static const real FOREIGN = 16;
-/* What a block leaves to the next of a sound that is longer than the paths: a reverberation time of
- * 0.64 s. */
-static const real FADES = (real)0.5;
-/* A surprise is located to this part of a block. */
-enum { EIGHTHS = 8 };
 /* At most so many steps of conjugate gradients in a block, until what is missing is this share of
  * the doubt. */
 enum { PLANT_STEPS = 8 };
@@ -508,20 +500,18 @@ static void hear_row(posterior *f, int32_t row, int32_t newest, int believed, re
         for (int32_t t = 0; t < newest; t++) heard[t] = sign_of(f->counts + RANDOM);
 }
 
-/* Let the data fade, and add the newest samples of the block, whose d^ has the energies `expected`.
+/* Let the data fade, and add the newest samples of the block, whose d^ has the energy `expected`.
  */
-static void add_samples(posterior *f, int32_t newest, int believed, const real *expected,
-                        real forget)
+static void add_samples(posterior *f, int32_t newest, int believed, real expected, real forget)
 {
     const int32_t C = f->C, N = f->N;
     const real share = raised(forget, newest);
     posterior_numbers *known = f->numbers;
-    real *heard = work_of(f, 2), *weight = work_of(f, 3), of_weights = 0, of_d = 0, w = 1;
+    real *heard = work_of(f, 2), *weight = work_of(f, 3), of_weights = 0, w = 1;
     for (int32_t t = 0; t < newest; t++) {
         weight[t] = w;
         w *= root(forget);
         of_weights += weight[t] * weight[t];
-        of_d += weight[t] * weight[t] * expected[t];
     }
     let_fade(f->before, times(C, N), root(share));
     let_fade(f->T, times(C * C, N), share);
@@ -541,21 +531,19 @@ static void add_samples(posterior *f, int32_t newest, int believed, const real *
         f->ee[row] = share * f->ee[row] + dot(heard, heard, newest) + noise;
     }
     known->samples = share * known->samples + of_weights;
-    known->explained = share * known->explained + of_d;
+    known->explained = share * known->explained + of_weights / (real)f->B * expected;
 }
 
-/* Energies of a block over the microphones, newest samples first: of what the posterior does not
- * explain, of d^ and of the errors. */
-typedef struct { real *missed, *expected, heard; } judgement;
+/* Energies of a block over the microphones: of what the posterior does not explain, of d^ and of
+ * the errors. */
+typedef struct { real missed, expected, heard; } judgement;
 
 /* Judge a block. If s^ is exact, add what is played to the errors, because it teaches nothing. */
 static judgement judge(posterior *f)
 {
     const int32_t B = f->B;
     real *part = work_of(f, 0), *d = work_of(f, 1), *z = work_of(f, 2);
-    judgement found = {.missed = work_of(f, 4), .expected = work_of(f, 5)};
-    clear(found.missed, (size_t)B);
-    clear(found.expected, (size_t)B);
+    judgement found = {0};
     for (int32_t k = 0; k < f->K; k++) {
         real *error = f->errors + times(k, B);
         found.heard += dot(error, error, B);
@@ -565,20 +553,11 @@ static judgement judge(posterior *f)
             add_to(error, part, B);
         }
         explain(f, f->theta + times(k, f->n), d, z);
-        for (int32_t t = 0; t < B; t++) {
-            const real missed = error[t] - d[t] + z[t];
-            found.missed[t] += missed * missed;
-            found.expected[t] += d[t] * d[t];
-        }
+        for (int32_t t = 0; t < B; t++) z[t] += error[t] - d[t];
+        found.missed += dot(z, z, B);
+        found.expected += dot(d, d, B);
     }
     return found;
-}
-
-static real sum_of(const real *a, int32_t n)
-{
-    real sum = 0;
-    for (int32_t i = 0; i < n; i++) sum += a[i];
-    return sum;
 }
 
 /* Return whether the loudspeakers sound in a block, or in what the secondary paths still hold. */
@@ -592,49 +571,29 @@ static int is_loud(const posterior *f)
     return 0;
 }
 
-/* Return the newest samples of a block that exceeds a limit, and belong to another plant: those
- * after the first eighth that exceeds it. */
-static int32_t after_change(const posterior *f, const real *missed, real limit)
-{
-    for (int32_t i = 1;; i++) {
-        const int32_t to = f->B - f->B * (i - 1) / EIGHTHS, from = f->B - f->B * i / EIGHTHS;
-        if (i == EIGHTHS || sum_of(missed + from, to - from) > limit * (real)(to - from))
-            return from;
-    }
-}
-
-/* Forget all if the plant has changed. Return how many of the newest samples are to be believed. */
-static int32_t notice_surprise(posterior *f, const judgement *is, int32_t newest, real forget)
+/* Return whether a block is to be believed. Forget all if it tells of another plant. */
+static int notice_surprise(posterior *f, const judgement *is, real forget)
 {
     posterior_numbers *known = f->numbers;
-    const int32_t B = f->B, last = B - B * (EIGHTHS - 1) / EIGHTHS;
-    const real each = (real)B * (real)f->K;
-    const real missed = sum_of(is->missed, B), expected = sum_of(is->expected, B);
-    /* The noise grows with the disturbance, as it did before, and falls as fast as a sound dies
-     * away that is longer than the paths. */
-    known->loud = larger(expected, FADES * known->loud);
-    const real noise =
-        known->expected > 0 ? known->missed / known->expected * known->loud / each : 0;
-    real limit = SURPRISE * larger(mean_noise(f), noise);
-    if (missed > limit * each) limit += SURPRISE * power_of_doubt(f);
-    if (missed > limit * each) {
-        const real in_last = sum_of(is->missed, last);
-        const real foretold = FOREIGN * sum_of(is->expected, last);
-        const real usual = known->explained / larger(known->samples, 1) * (real)last;
-        /* What is over already, or has no part of x, tells nothing of the plant. */
-        if (in_last <= limit * (real)last * (real)f->K || (in_last > foretold && usual > foretold))
-            return 0;
-        newest = after_change(f, is->missed, limit * (real)f->K);
+    const real each = (real)f->B * (real)f->K;
+    /* The noise grows with the disturbance, as it did before. */
+    const real grown =
+        known->expected > 0 ? known->missed / known->expected * is->expected / each : 0;
+    const real noise = larger(mean_noise(f), grown);
+    if (is->missed > SURPRISE * noise * each &&
+        is->missed > SURPRISE * (noise + power_of_doubt(f)) * each) {
         count_up(f->alarms);
         known->spread = REDRAWN;
         f->counts[WAITING] = 1;
-        f->counts[SILENT] = is->heard >= expected; /* the control does no good: listen to p alone */
-        begin_data(f, newest);
+        /* If the control does no good, listen to p alone. */
+        f->counts[SILENT] = is->heard >= is->expected;
+        begin_data(f, 0);
+        return 0;
     }
-    forget = raised(forget, B);
-    known->missed = forget * known->missed + (missed < expected ? missed : expected);
-    known->expected = forget * known->expected + expected;
-    return newest;
+    forget = raised(forget, f->B);
+    known->missed = forget * known->missed + smaller(is->missed, is->expected);
+    known->expected = forget * known->expected + is->expected;
+    return 1;
 }
 
 /* Return whether a block has more energy than the data, of the references or of what is played. */
@@ -658,8 +617,9 @@ static void learn_samples(posterior *f, int32_t newest, real forget)
     const judgement is = judge(f);
     int32_t believed = newest;
     /* Judged is what was fitted to data that include the loudspeakers, unless they are silent. */
-    if (newest && known && (f->exact || f->numbers->taught > 0 || !is_loud(f)))
-        believed = notice_surprise(f, &is, newest, forget);
+    if (newest && known && (f->exact || f->numbers->taught > 0 || !is_loud(f)) &&
+        !notice_surprise(f, &is, forget))
+        believed = 0;
     if (!believed && !f->counts[WAITING] && outweighs_data(f))
         begin_data(f, 0);
     else if (believed || !f->counts[WAITING])

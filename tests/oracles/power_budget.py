@@ -112,7 +112,7 @@ class Plant:
         self.q, self.significant, self.precision = np.zeros(self.K), 1.0, np.zeros(self.mask.size)
         self.begun = self.waiting = self.silent = False  # waiting: no fit of a whole block since a surprise
         self.fits = self.surprises = self.turn = 0
-        self.missed = self.expected = self.loud = self.taught = 0.0
+        self.missed = self.expected = self.taught = 0.0
 
     def signs(self, rows, n):
         """Return random signs."""
@@ -156,8 +156,8 @@ class Plant:
         Z = regressors(z, N)
         d = self.significant * self.theta[:K, : self.split] @ Z[:, : self.split].T
         if new and known and (self.exact or not played or self.taught > 0):
-            missed = np.mean((e - self.theta[:K] @ Z.T) ** 2, axis=0)
-            new = self.judge(missed, np.mean(d**2, axis=0), heard, z, Z)
+            missed = np.mean((e - self.theta[:K] @ Z.T) ** 2)
+            new = new if self.believes(missed, np.mean(d**2), heard, z, Z) else 0
         x2, y2 = (np.sum(z[part, -self.B :] ** 2) for part in (slice(I), slice(I, None)))
         outweighs = self.count == 0 or x2 >= self.energy_of(slice(I)) or y2 > self.energy_of(slice(I, None))
         if not new and not self.waiting and outweighs:
@@ -167,28 +167,21 @@ class Plant:
         if new and self.fit() and new == self.B:
             self.waiting = self.silent = False
 
-    def judge(self, missed, d2, heard, z, Z):
-        """Return how many of the newest samples are to be believed; forget all if they tell of another plant."""
-        ends = self.B * np.arange(1, core.EIGHTHS + 1) // core.EIGHTHS
-        self.loud = max(np.mean(d2), core.FADES * self.loud)
-        noise = max(np.mean(self.q), self.missed / max(self.expected, 1e-300) * self.loud)
+    def believes(self, missed, d2, heard, z, Z):
+        """Return whether a block is to be believed; forget all if it tells of another plant."""
+        noise = max(np.mean(self.q), self.missed / max(self.expected, 1e-300) * d2)
         if self.exact:
             doubt = np.mean(self.q) * self.n / self.count
         else:
             doubt = np.mean(self.q) * np.sum((self.theta[self.K :] @ Z.T) ** 2) / (self.B * core.DRAWS)
-        limit, new = core.SURPRISE * (noise + doubt), self.B
-        if np.mean(missed) > limit:
-            of_part, last = [np.mean(part) for part in np.split(missed, ends[:-1])], np.mean(d2[ends[-2] :])
-            usual = self.explained / (max(self.count, 1.0) * self.K)
-            if of_part[-1] <= limit or (of_part[-1] > core.FOREIGN * last and core.FOREIGN * last < usual):
-                return 0  # over already, or none of x: it tells nothing of the plant
-            new = self.B - ends[np.argmax(np.array(of_part) > limit)]
+        if missed > core.SURPRISE * (noise + doubt):
             self.spread, self.waiting, self.surprises = core.REDRAWN, True, self.surprises + 1
-            self.silent = heard >= np.mean(d2)  # the control does no good: listen to p alone
-            self.begin(z, new)
-        self.missed = self.forget * self.missed + min(np.mean(missed), np.mean(d2))
-        self.expected = self.forget * self.expected + np.mean(d2)
-        return new
+            self.silent = heard >= d2  # the control does no good: listen to p alone
+            self.begin(z, 0)
+            return False
+        self.missed = self.forget * self.missed + min(missed, d2)
+        self.expected = self.forget * self.expected + d2
+        return True
 
     def add(self, Z, d, e, new):
         """Add the block, or its newest samples; if there are none, what the posterior expects: nothing changes then."""
@@ -202,7 +195,7 @@ class Plant:
         fade = np.repeat([f, math.sqrt(f)], [self.K, core.DRAWS])[:, None]  # unit noise is drawn for faded samples
         self.before, self.G, self.r = f * self.before, f * self.G + Z.T @ Z, fade * self.r + told @ Z
         self.ee, self.count = f * self.ee + energy, f * self.count + np.sum(w**2)
-        self.explained = f * self.explained + np.sum((d[:, -rows:] * w) ** 2)
+        self.explained = f * self.explained + np.sum(w**2) * np.sum(d**2) / self.B
 
     def fit(self):
         """Take some steps towards (G + q P) theta = r + q P mean, and estimate q; return False if nothing can be told."""
@@ -302,8 +295,7 @@ class PowerBudget(Controller):
         self.blocks = max(round(self.averaging_s * self.fs / self.B), core.BLOCK_LASTS)  # T, of the averaging time
         self.book = np.ones((self.blocks, J))  # power of each block over the rating, newest first: all is spent
         self.set_room()
-        self.price, self.steady_price = np.zeros(J), np.zeros(J)
-        self.now, self.steady = np.zeros((J, I * L)), np.zeros((J, I * L))  # filters at these prices
+        self.price, self.now = np.zeros(J), np.zeros((J, I * L))  # filters at these prices
 
     def hear(self, x):
         """Take the newest references, without clicks."""
@@ -358,29 +350,15 @@ class PowerBudget(Controller):
         self.room = left * self.B * self.rated_power
 
     def solve(self):
-        """Set the prices, and the filters of least expected error at these prices."""
+        """Set the prices at which the accounts afford the filters of least expected error; what a step leaves is cut."""
         self.set_equations()
-        # 1 The prices at which the filters spend the rating, for the spectrum of the window of x and the level of the
-        # shorter one, which the last filters tell.
-        L, last = self.w.shape[2], self.w.reshape(self.now.shape)
-        usual, now = power_of(last, self.R), power_of(last, toeplitz(two_sided(self.short_lags), L))
+        last = self.w.reshape(self.now.shape)
+        usual, now = power_of(last, self.R), power_of(last, toeplitz(two_sided(self.short_lags), self.w.shape[2]))
         level = np.divide(now, usual, where=(usual > 0) & (now > 0), out=np.ones_like(now))
-        for _ in range(core.PRICE_STEPS):
-            self.steady = self.solved(self.steady_price, self.steady)
-            self.steady_price = self.next_price(self.steady_price, self.steady, self.rated_power / level)
-        # 2 What the account holds makes power cheaper, but none that saves little of the noise.
-        left = np.maximum(1.0 - np.mean(self.book, axis=0), 0.0)
-        floor = core.WORTHWHILE * np.sum(self.plant.q) / (self.rated_power * len(self.w))
-        cheaper = np.maximum(1.0 - core.CHEAPER * left, core.CHEAPEST)
-        self.price = np.maximum(self.steady_price * cheaper, floor)
         self.now = self.solved(self.price, self.now)
-        # 3 The account must stand it, and for longer if a silence has left more than the price follows.
-        later = np.where(core.CHEAPER * left > 1.0 - core.CHEAPEST, np.minimum(level, 1.0), 0.0)
-        share = self.share(self.now, later)
-        if np.any(share < 1.0):
-            self.price = self.next_price(self.price, self.now, np.minimum(share, 1.0) * power_of(self.now, self.R))
-            self.now = self.solved(self.price, self.now)
-            share = self.share(self.now, later)
+        self.price = self.next_price(self.price, self.now, self.afforded(np.minimum(level, 1.0)))
+        self.now = self.solved(self.price, self.now)
+        share = self.afforded(np.minimum(level, 1.0)) / np.maximum(power_of(self.now, self.R), 1e-300)
         self.w = (self.now * np.sqrt(np.minimum(share, 1.0))[:, None]).reshape(self.w.shape)
 
     def set_equations(self):
@@ -416,26 +394,26 @@ class PowerBudget(Controller):
         step = size * np.linalg.solve(H, size * power * (np.sqrt(power / target) - 1))
         if not step @ (power - target) > 0:
             step = size * np.linalg.solve(H, size * (power - target) / 2)
-        price = price + np.clip(step, -price, np.maximum(core.PRICE_RISES * price, 1e-3 * self.gain))
+        price = np.maximum(price + step, 0.0)
         return np.where(price < 1e-9 * self.gain, 0.0, price)
 
-    def share(self, v, later):
-        """Return the largest shares of their power that the accounts stand.
+    def afforded(self, level):
+        """Return the powers that the accounts afford, if the noise goes on.
 
-        They must stand the power of the last block for T/20, that of the window of x for T/4, and `later` times it, for any
-        longer time: so what a silence has left is spent evenly.
+        As in the last block for T/20, as in the window of x for T/4, and at the level of now for any longer time: so what
+        a silence has left is spent evenly.
         """
         T, window, block = self.blocks, self.blocks // core.WINDOW_LASTS, self.blocks // core.BLOCK_LASTS
-        spent = np.concatenate([np.zeros((1, len(v))), np.cumsum(self.book, axis=0)])
-        X, power = regressors(self.x_past, self.w.shape[2])[-self.B :], power_of(v, self.R)
-        planned = core.PLANNED * T
-        expected = [(power, window, planned), (np.mean((X @ v.T) ** 2, axis=0), block, planned)]  # for so many blocks
-        expected += [(later * power, n, T) for n in range(window + 1, T - block + 1)]
-        shares = []
-        for P, n, all_of_it in expected:
-            left = np.maximum(all_of_it - spent[T - n], core.LEAST_SHARE * n) / n * self.rated_power
-            shares.append(left / np.maximum(P, 1e-300))
-        return np.min(shares, axis=0)
+        spent = np.concatenate([np.zeros((1, len(self.now))), np.cumsum(self.book, axis=0)])
+        X = regressors(self.x_past, self.w.shape[2])[-self.B :]
+        power, of_block = power_of(self.now, self.R), np.mean((X @ self.now.T) ** 2, axis=0)
+        louder = np.divide(power, of_block, where=(of_block > 0) & (power > 0), out=np.full_like(power, np.inf))
+
+        def each(n, planned):
+            return np.maximum((planned * T - spent[T - n]) / n, core.PLANNED - 1) * self.rated_power
+
+        longer = [each(n, 1.0) / level for n in range(window + 1, T - block + 1)]
+        return np.min([each(window, core.PLANNED), each(block, core.PLANNED) * louder, *longer], axis=0)
 
 
 def power_of(v, R):
