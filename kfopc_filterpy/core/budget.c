@@ -30,8 +30,7 @@ enum { WINDOW_LASTS = 4, BLOCK_LASTS = 20 };
 /* The level of x is that of an exponential window which is so much shorter than that of its
  * spectrum: a spectrum needs many samples, a level few. */
 enum { SHORTER = 5 };
-/* A sound does not grow by more than this from one sample to the next, but a click in a reference
- * does. */
+/* A sound does not grow by more than this from one sample to the next, but a click does. */
 static const real GROWTH = 10;
 /* Steps of conjugate gradients towards filters. */
 enum { FILTER_STEPS = 6 };
@@ -48,7 +47,7 @@ typedef struct {
     posterior posterior;
     int32_t T;                /* blocks of the account */
     real *asked;              /* (3, J) now; sum of squares of the block; the most it may become */
-    real *peak;               /* (I) largest magnitude of x of late */
+    real *peak;               /* (I + K) largest magnitudes of x and e of late */
     int32_t *controlled;      /* whether control was on in the block */
     real *R, *short_R;        /* (I, I, N) windowed sums of x_i(t) x_a(t - l) */
     real *weight;             /* (2) of these windows */
@@ -104,7 +103,7 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     f->T = (int32_t)averaging;
     f->width = N + B;
     f->asked = reals(at, "asked", ANC_STATE, 1, 1, 3, J);
-    f->peak = reals(at, "reference_peak", ANC_STATE, 1, 1, 1, I);
+    f->peak = reals(at, "peaks", ANC_STATE, 1, 1, 1, I + s->K);
     f->controlled = int32s(at, "controlled", ANC_STATE, 1);
     f->R = reals(at, "reference_correlation", ANC_STATE, 1, I, I, N);
     f->short_R = reals(at, "short_correlation", ANC_STATE, 1, I, I, N);
@@ -564,6 +563,28 @@ static int fault_of(const budget *f, const real *error)
     return ANC_DONE;
 }
 
+/* Return whether a sample is a click. A sound that sets in after silence is one, too, until its
+ * peak has grown. */
+static int is_click(const budget *f, real x, real *peak)
+{
+    const real size = x < 0 ? -x : x, most = GROWTH * *peak;
+    const int click = most > 0 && size > most;
+    *peak = larger(click ? most : size, faded(*peak, *f->s.setting[WINDOW], 0));
+    return click;
+}
+
+/* Cut clicks from the newest references: nothing is learned while cut samples are in the delay
+ * lines. */
+static void cut_clicks(budget *f)
+{
+    for (int32_t i = 0; i < f->s.I; i++) {
+        real *x = newest(&f->s.x, i);
+        if (!is_click(f, *x, f->peak + i)) continue;
+        *x = *x < 0 ? -f->peak[i] : f->peak[i];
+        f->posterior.heard[HEARD] = -1 - f->posterior.heard[FILLED];
+    }
+}
+
 /* Note a sample; at the end of a block, learn. */
 static int note(budget *f, const real *error, int controlled)
 {
@@ -579,24 +600,11 @@ static int note(budget *f, const real *error, int controlled)
     }
     *f->controlled |= controlled;
     complete_sample(p, error);
+    /* Nothing is learned from a block with a click in an error. */
+    for (int32_t k = 0; error && k < s->K; k++)
+        p->heard[MISSING] |= is_click(f, error[k], f->peak + s->I + k);
     if (p->heard[FILLED] == p->B) end_block(f);
     return ANC_DONE;
-}
-
-/* Cut clicks from the newest references. A sound that sets in after silence is cut, too, until the
- * peak has grown: nothing is learned while cut samples are in the delay lines. */
-static void cut_clicks(budget *f)
-{
-    for (int32_t i = 0; i < f->s.I; i++) {
-        real *x = newest(&f->s.x, i), size = *x < 0 ? -*x : *x;
-        const real most = GROWTH * f->peak[i];
-        if (most > 0 && size > most) {
-            size = most;
-            *x = *x < 0 ? -most : most;
-            f->posterior.heard[HEARD] = -1 - f->posterior.heard[FILLED];
-        }
-        f->peak[i] = larger(size, faded(f->peak[i], *f->s.setting[WINDOW], 0));
-    }
 }
 
 static int control_signal_budget(anc_view *view, const real *reference, real *control)

@@ -291,7 +291,11 @@ class PowerBudget(Controller):
         self.window, self.short = (Window(I, self.N, g, self.B) for g in (self.g, self.g**core.SHORTER))
         self.x_past, self.y_past = np.zeros((I, self.N - 1 + self.B)), np.zeros((J, self.N - 1 + self.B))
         self.new, self.asked = [], []  # samples of this block: x, y, e; the squares asked for
-        self.peak, self.heard = np.zeros(I), 0  # of |x| of late; samples that the delay lines hold, as they were
+        self.peak, self.e_peak, self.heard = (
+            np.zeros(I),
+            np.zeros(len(self.s_hat)),
+            0,
+        )  # of |x|, |e| of late; samples that the delay lines hold, as they were
         self.blocks = max(round(self.averaging_s * self.fs / self.B), core.BLOCK_LASTS)  # T, of the averaging time
         self.book = np.ones((self.blocks, J))  # power of each block over the rating, newest first: all is spent
         self.set_room()
@@ -299,12 +303,16 @@ class PowerBudget(Controller):
 
     def hear(self, x):
         """Take the newest references, without clicks."""
-        most = np.where(self.peak > 0, core.GROWTH * self.peak, np.inf)
-        if np.any(np.abs(x) > most):  # false: nothing is learned until the delay lines hold no more of it
+        cut, self.peak = self.without_clicks(x, self.peak)
+        if np.any(cut != x):  # nothing is learned until the delay lines hold no more of it
             self.heard = -1 - len(self.new)
-        x = np.clip(x, -most, most)
-        self.peak = np.maximum(np.abs(x), self.g * self.peak)
-        super().hear(x)
+        super().hear(cut)
+
+    def without_clicks(self, signal, peak):
+        """Return samples without clicks, and the peaks of late."""
+        most = np.where(peak > 0, core.GROWTH * peak, np.inf)
+        cut = np.clip(signal, -most, most)
+        return cut, np.maximum(np.abs(cut), self.g * peak)
 
     def output(self):
         """Return y_j = sum_i v_ji * x_i, cut to what the account has left, and note what is asked."""
@@ -316,6 +324,9 @@ class PowerBudget(Controller):
 
     def adapt(self, e):
         """Note the sample; e is nan if it was not heard."""
+        if np.all(np.isfinite(e)):
+            cut, self.e_peak = self.without_clicks(e, self.e_peak)
+            e = np.where(cut == e, e, np.nan)  # nothing is learned from a block with a click
         self.new.append((self.x[:, 0].copy(), self.output_line[:, 0].copy(), e))
         if len(self.new) == self.B:
             self.end_block(*(np.transpose(signals) for signals in zip(*self.new, strict=True)))
