@@ -178,10 +178,7 @@ static int set_prior(posterior *f)
     }
     if (!(x2 > 0)) return 0;
     known->prior_s = (real)f->M / (known->spread * known->spread * size_of_path(f));
-    const real prior = x2 * (real)f->N * (real)f->K / (e2 + known->explained);
-    /* A solution of soft data is no start for that of loud ones, but the prior is. */
-    f->counts[FRESH] |= prior > LOUDER * known->prior;
-    known->prior = prior;
+    known->prior = x2 * (real)f->N * (real)f->K / (e2 + known->explained);
     for (int32_t k = 0; q == 0 && k < f->K; k++) f->q[k] = (real)1e-3 * f->ee[k] / known->samples;
     return 1;
 }
@@ -330,11 +327,11 @@ static void set_theta(posterior *f)
         }
 }
 
-/* Return the energy of y in the data. */
-static real energy_of_control(const posterior *f)
+/* Return the energy in the data of the signals from `begin` to `end`. */
+static real energy_of_data(const posterior *f, int32_t begin, int32_t end)
 {
     real energy = 0;
-    for (int32_t c = f->I; c < f->C; c++) energy += f->T[times(c * f->C + c, f->N)];
+    for (int32_t c = begin; c < end; c++) energy += f->T[times(c * f->C + c, f->N)];
     return energy;
 }
 
@@ -372,7 +369,7 @@ static int approach_posterior(posterior *f)
     set_theta(f);
     count_up(f->fits);
     f->counts[FRESH] = 0;
-    f->numbers->taught = energy_of_control(f);
+    f->numbers->taught = energy_of_data(f, f->I, f->C);
     return 1;
 }
 
@@ -596,15 +593,12 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     return 1;
 }
 
-/* Return whether a block has more energy than the data, of the references or of what is played. */
-static int outweighs_data(const posterior *f)
+/* Return the energy of a block of the signals from `begin` to `end`. */
+static real energy_of_block(const posterior *f, int32_t begin, int32_t end)
 {
-    real block[2] = {0, 0}, data[2] = {0, 0};
-    for (int32_t c = 0; c < f->C; c++) {
-        block[c >= f->I] += dot(history_of(f, c), history_of(f, c), f->B);
-        data[c >= f->I] += f->T[times(c * f->C + c, f->N)];
-    }
-    return block[0] >= data[0] || block[1] > data[1] || !(f->numbers->samples > 0);
+    real energy = 0;
+    for (int32_t c = begin; c < end; c++) energy += dot(history_of(f, c), history_of(f, c), f->B);
+    return energy;
 }
 
 /* Learn from the newest samples of a block; 0: its errors are not known. */
@@ -620,10 +614,18 @@ static void learn_samples(posterior *f, int32_t newest, real forget)
     if (newest && known && (f->exact || f->numbers->taught > 0 || !is_loud(f)) &&
         !notice_surprise(f, &is, forget))
         believed = 0;
-    if (!believed && !f->counts[WAITING] && outweighs_data(f))
-        begin_data(f, 0);
-    else if (believed || !f->counts[WAITING])
-        add_samples(f, believed ? believed : f->B, believed > 0, is.expected, forget);
+    const real x2 = energy_of_block(f, 0, f->I), y2 = energy_of_block(f, f->I, f->C);
+    const real x2_of_data = energy_of_data(f, 0, f->I), y2_of_data = energy_of_data(f, f->I, f->C);
+    if (believed) {
+        if (x2 > LOUDER * x2_of_data)
+            begin_data(f, believed); /* what soft samples told is little */
+        add_samples(f, believed, 1, is.expected, forget);
+    } else if (!f->counts[WAITING]) {
+        if (x2 >= x2_of_data || y2 > y2_of_data || !(f->numbers->samples > 0))
+            begin_data(f, 0); /* the block would stand for more than is known */
+        else
+            add_samples(f, f->B, 0, is.expected, forget);
+    }
     if (believed && approach_posterior(f) && believed == f->B)
         f->counts[WAITING] = f->counts[SILENT] = 0;
 }

@@ -159,10 +159,14 @@ class Plant:
             missed = np.mean((e - self.theta[:K] @ Z.T) ** 2)
             new = new if self.believes(missed, np.mean(d**2), heard, z, Z) else 0
         x2, y2 = (np.sum(z[part, -self.B :] ** 2) for part in (slice(I), slice(I, None)))
-        outweighs = self.count == 0 or x2 >= self.energy_of(slice(I)) or y2 > self.energy_of(slice(I, None))
-        if not new and not self.waiting and outweighs:
-            self.begin(z, 0)  # what the block would stand for is more than what is known
-        elif new or not self.waiting:
+        x2_of_data, y2_of_data = self.energy_of(slice(I)), self.energy_of(slice(I, None))
+        if new:
+            if x2 > core.LOUDER * x2_of_data:
+                self.begin(z, new)  # what soft samples told is little
+            self.add(Z, d, e, new)
+        elif not self.waiting and (self.count == 0 or x2 >= x2_of_data or y2 > y2_of_data):
+            self.begin(z, 0)  # the block would stand for more than is known
+        elif not self.waiting:
             self.add(Z, d, e, new)
         if new and self.fit() and new == self.B:
             self.waiting = self.silent = False
@@ -206,9 +210,7 @@ class Plant:
         if not np.any(self.q):
             self.q = 1e-3 * self.ee / self.count
         # |p|^2 is expected to be E[d^2 + e^2] / E[x^2] of the data of now.
-        prior = split * x2 * K / (np.sum(self.ee) + self.explained)
-        self.fresh |= prior > core.LOUDER * self.precision[0]  # what soft data told is no start for loud ones
-        self.precision[:split] = prior
+        self.precision[:split] = split * x2 * K / (np.sum(self.ee) + self.explained)
         self.precision[split:] = self.M / ((self.spread or 1.0) ** 2 * np.mean(np.sum(self.s_hat**2, axis=2)))
         q = np.mean(self.q)
         ridge = q * self.precision
