@@ -600,9 +600,9 @@ static int note(budget *f, const real *error, int controlled)
     }
     *f->controlled |= controlled;
     complete_sample(p, error);
-    /* Nothing is learned from a block with a click in an error. */
+    /* Nothing is learned from a block with a click in an error, if anything is known. */
     for (int32_t k = 0; error && k < s->K; k++)
-        p->heard[MISSING] |= is_click(f, error[k], f->peak + s->I + k);
+        p->heard[MISSING] |= is_click(f, error[k], f->peak + s->I + k) && *p->fits;
     if (p->heard[FILLED] == p->B) end_block(f);
     return ANC_DONE;
 }

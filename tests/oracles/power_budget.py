@@ -328,7 +328,8 @@ class PowerBudget(Controller):
         """Note the sample; e is nan if it was not heard."""
         if np.all(np.isfinite(e)):
             cut, self.e_peak = self.without_clicks(e, self.e_peak)
-            e = np.where(cut == e, e, np.nan)  # nothing is learned from a block with a click
+            if self.plant.fits:
+                e = np.where(cut == e, e, np.nan)  # nothing is learned from a block with a click
         self.new.append((self.x[:, 0].copy(), self.output_line[:, 0].copy(), e))
         if len(self.new) == self.B:
             self.end_block(*(np.transpose(signals) for signals in zip(*self.new, strict=True)))

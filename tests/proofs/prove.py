@@ -46,7 +46,7 @@ COVARIANCE = {
 BUDGET = {
     "start_fourier": 1000,
     **dict.fromkeys(("transform_complex", "set_right", "set_theta"), 100),
-    **dict.fromkeys(("add_lags", "dot", "explain", "after_change"), 30),
+    **dict.fromkeys(("add_lags", "dot", "explain"), 30),
 }
 ANY_ANSWER = (  # of the processor, of which Eva knows nothing
     (
@@ -275,7 +275,7 @@ CONTROLLERS = {  # their name in C, and their file
 }
 # What Eva must analyse to the last statement: a block's end, a fit, a surprise and the silence after it, clicks.
 LEARNING = (
-    *("control_signal_budget", "cut_clicks", "note", "end_block", "learn", "notice_surprise", "after_change"),
+    *("control_signal_budget", "cut_clicks", "note", "end_block", "learn", "notice_surprise"),
     *("begin_block", "approach", "solve_all", "next_prices"),
 )
 # A block of 13 samples and 16 numbers in a transform have every way to sum, and to step through a transform.
@@ -296,12 +296,13 @@ KALMAN_FAULTS = {  # a file, what is right in it, and what is not
     "a delay line that ends late": ("signals.c", "*l->at = l->length - l->taps;", "*l->at = l->length - l->taps + 1;"),
 }
 BUDGET_FAULTS = {
-    "a spectrum too long": ("fourier.c", "im[0] = im[H] = 0;", "im[0] = im[H + 1] = 0;"),
-    "a sample too many transformed": ("fourier.c", "2 * k + 1 < n ?", "2 * k < n ?"),
+    "a spectrum too long": ("fourier.c", "scratch_row(f, 1)), (size_t)f->F);", "scratch_row(f, 1)), (size_t)f->F + 1);"),
+    "a sample too many transformed": ("fourier.c", "first = n < H ? n : H", "first = n < H ? n + 1 : H"),
     "a lag too many": ("fourier.c", "l < lags; l++) to[l] +=", "l <= lags; l++) to[l] +="),
     "a history moved too far": ("posterior.c", "(size_t)(f->history - f->B));", "(size_t)(f->history - f->B + 1));"),
     "an error too late": ("posterior.c", "at = f->B - 1 - f->heard[FILLED]", "at = f->B - f->heard[FILLED]"),
-    "a change found too late": ("posterior.c", "f->B * i / EIGHTHS;", "f->B * i / EIGHTHS + 2;"),
+    "a click of no microphone": ("budget.c", "f->peak + s->I + k)", "f->peak + s->I + k + 1)"),
+    "a draw too many": ("posterior.c", "(f->counts[TURN] + 1) % draws", "f->counts[TURN] + 1"),
     "a block too long": ("budget.c", "if (p->heard[FILLED] == p->B)", "if (p->heard[FILLED] > p->B)"),
     "a book moved too far": ("budget.c", "times(f->T - 1, J)", "times(f->T, J)"),
     "a weight too many silenced": (
