@@ -302,7 +302,6 @@ BUDGET_FAULTS = {
     "a history moved too far": ("posterior.c", "(size_t)(f->history - f->B));", "(size_t)(f->history - f->B + 1));"),
     "an error too late": ("posterior.c", "at = f->B - 1 - f->heard[FILLED]", "at = f->B - f->heard[FILLED]"),
     "a click of no microphone": ("budget.c", "f->peak + s->I + k)", "f->peak + s->I + k + 1)"),
-    "a draw too many": ("posterior.c", "(f->counts[TURN] + 1) % draws", "f->counts[TURN] + 1"),
     "a block too long": ("budget.c", "if (p->heard[FILLED] == p->B)", "if (p->heard[FILLED] > p->B)"),
     "a book moved too far": ("budget.c", "times(f->T - 1, J)", "times(f->T, J)"),
     "a weight too many silenced": (
