@@ -133,18 +133,19 @@ static real *transform_complex(const fourier *f, real *a, real *b)
  * of both halves is one of half the length. */
 void transform(const fourier *f, real *spectrum, const real *from, int32_t n)
 {
-    const int32_t H = f->half, first = n < H ? n : H, second = n - first;
+    const int32_t H = f->half;
     real *restrict re = scratch_row(f, 0), *restrict im = re + H;
     const real *restrict c = cosines(f, f->F), *restrict d = sines(f, f->F);
-    for (int32_t k = 0; k < second; k++) {
+    int32_t k = 0;
+    for (; k < n - H; k++) {
         re[k] = from[k] * c[k] - from[H + k] * d[k];
         im[k] = -from[k] * d[k] - from[H + k] * c[k];
     }
-    for (int32_t k = second; k < first; k++) {
+    for (; k < n && k < H; k++) {
         re[k] = from[k] * c[k];
         im[k] = -from[k] * d[k];
     }
-    for (int32_t k = first; k < H; k++) re[k] = im[k] = 0;
+    for (; k < H; k++) re[k] = im[k] = 0;
     copy(spectrum, transform_complex(f, re, scratch_row(f, 1)), (size_t)f->F);
 }
 
