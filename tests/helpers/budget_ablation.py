@@ -28,6 +28,7 @@ if __name__ == "__main__" and "PYTHONPATH" not in os.environ:
 
 from comparisons.studies import events  # noqa: E402
 from comparisons.studies import kf_pb_cases as study  # noqa: E402
+from comparisons.studies.cases import FS  # noqa: E402
 from kfopc_filterpy import Plant, kf_pb, noise_reduction_db, simulate  # noqa: E402
 from kfopc_filterpy.core.library import load  # noqa: E402
 from kfopc_filterpy.metrics import overshoot  # noqa: E402
@@ -88,7 +89,7 @@ def measure(made: Path) -> dict[str, Any]:
     for name, case in pickle.loads(made.read_bytes()):
         controller = case.kf_pb(case.secondary)
         run = case.run(controller)
-        power = overshoot(run.control_signal, case.rated_power, study.FS, window_s=10.0)
+        power = overshoot(run.control_signal, case.rated_power, FS, window_s=10.0)
         of_cases[name] = case.reduction_db(run.error), power, int(controller.alarms)
     of_cases["three loudspeakers"] = *three_loudspeakers(), 0
     return {"events": of_events, "cases": of_cases}
@@ -128,6 +129,13 @@ for level in {own.LEVELS[0], sys.argv[2]}:
 """
 
 
+HEADING = f"""\
+Against the law as it is: the most that is lost in a second, from the second one after an event on (dB), and in which event; the
+change of the noise reduction of the noises, on average and at worst (dB), and of which. Loudest 100 ms of all events (dB); power
+over any averaging time, and alarms, of all events and of all noises.
+{"without":13}{"lost":>6} {"event":35}{"100 ms":>6}{"power":>7}{"":4}{"mean":>7}{"worst":>7} {"noise":44}{"power":>6}"""
+
+
 def line(constant: str, own: dict[str, Any], usual: dict[str, Any]) -> str:
     """Return a row of the table: the most that is lost against the law as it is, and where."""
     lost = {name: max(np.subtract(row[0], usual["events"][name][0])) for name, row in own["events"].items()}
@@ -150,6 +158,7 @@ def main(*names: str) -> None:
         made.write_bytes(pickle.dumps(cases()))
         measured = pool.map(partial(measured_without, folder=Path(folder), made=made), ("", *constants))
         usual: dict[str, Any] = {}
+        print(HEADING)
         for constant, own in tqdm(zip(("", *constants), measured, strict=True), total=1 + len(constants), disable=None):
             usual = usual or own
             tqdm.write(line(constant, own, usual), file=sys.stdout)
