@@ -420,8 +420,8 @@ static void set_slopes(budget *f, real *H)
 }
 
 /* Make a step of Newton's method with the prices, of which power^-1/2 is nearly a line, with the
- * slope power^-3/2 u'A^-1 u. */
-static void next_prices(budget *f, const real *power, const real *target)
+ * slope power^-3/2 u'A^-1 u. Return whether a price has changed. */
+static int next_prices(budget *f, const real *power, const real *target)
 {
     const int32_t J = f->s.J;
     real *H = f->small, *size = H + times(J, J), *step = size + J;
@@ -445,10 +445,13 @@ static void next_prices(budget *f, const real *power, const real *target)
             gain += step[j] * (power[j] - target[j]);
         }
     }
+    int changed = 0;
     for (int32_t j = 0; j < J; j++) {
-        price[j] += larger(step[j], -price[j]);
-        if (price[j] < (real)1e-9 * f->gain[j]) price[j] = 0;
+        const real last = price[j], next = larger(last + step[j], 0);
+        price[j] = next < (real)1e-9 * f->gain[j] ? 0 : next;
+        changed |= price[j] != last;
     }
+    return changed;
 }
 
 /* The account. */
@@ -513,8 +516,7 @@ static void solve_all(budget *f)
     set_equations(f);
     set_levels(f, level);
     solve_at_prices(f, level, power, afforded);
-    next_prices(f, power, afforded);
-    solve_at_prices(f, level, power, afforded);
+    if (next_prices(f, power, afforded)) solve_at_prices(f, level, power, afforded);
     for (int32_t j = 0; j < J; j++) {
         const real share = power[j] > afforded[j] ? root(afforded[j] / power[j]) : 1;
         for (int32_t i = 0; i < n; i++)

@@ -370,8 +370,9 @@ class PowerBudget(Controller):
         usual, now = power_of(last, self.R), power_of(last, toeplitz(two_sided(self.short_lags), self.w.shape[2]))
         level = np.divide(now, usual, where=(usual > 0) & (now > 0), out=np.ones_like(now))
         self.now = self.solved(self.price, self.now)
-        self.price = self.next_price(self.price, self.now, self.afforded(np.minimum(level, 1.0)))
-        self.now = self.solved(self.price, self.now)
+        last, self.price = self.price, self.next_price(self.price, self.now, self.afforded(np.minimum(level, 1.0)))
+        if np.any(self.price != last):
+            self.now = self.solved(self.price, self.now)
         share = self.afforded(np.minimum(level, 1.0)) / np.maximum(power_of(self.now, self.R), 1e-300)
         self.w = (self.now * np.sqrt(np.minimum(share, 1.0))[:, None]).reshape(self.w.shape)
 
