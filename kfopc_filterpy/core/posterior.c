@@ -165,7 +165,7 @@ static real precision_of(const posterior *f, int32_t c)
 }
 
 /* Set the precisions: of the primary paths from |p|^2 = E[d^2 + e^2] / E[x^2] of the data of now.
- * Set the first noise. Return 0 if nothing can be told yet. */
+ * Guess the first noise: -30 dB, which counts as n samples. Return 0 if nothing can be told yet. */
 static int set_prior(posterior *f)
 {
     posterior_numbers *known = f->numbers;
@@ -293,7 +293,8 @@ static real noise_of(posterior *f, int32_t k, real q, const real *rest)
             residual += t[i] * (right[i] - rest[times(c, f->N) + (size_t)i] - pull - 2 * r[i]);
         }
     }
-    /* The earlier estimate counts as n samples: a short record leaves little noise by chance. */
+    /* The earlier estimate counts as n samples: a short record leaves little noise by chance. Below
+     * -60 dB, it could be rounding. */
     const real weight = larger(samples - (real)(f->I * f->N) / 2, 0) + n;
     return larger((larger(residual, 0) + n * f->q[k]) / weight, (real)1e-6 * f->ee[k] / samples);
 }
