@@ -137,10 +137,9 @@ static anc_real signal[4 * MOST][SAMPLES], reference[MOST][SAMPLES], disturbance
 
 /* Make the input hard: tones, which excite few directions, first softly, with silence between; and
  * a click. */
-static void harden(int32_t K, int32_t I)
+static void harden(int32_t K, int32_t I, anc_real click)
 {
     static const anc_real period[8] = {1, 0.75f, 0, -0.75f, -1, -0.75f, 0, 0.75f};
-    const anc_real click = sizeof click == sizeof(float) ? 4096.0f : 1e30f;
     for (int32_t n = 0; n < SAMPLES; n++) {
         const anc_real level = n < 64 ? 0x1p-20f : n < 300 || n >= 350 ? 1 : 0;
         for (int32_t i = 0; i < I; i++) reference[i][n] = level * period[(n + i) % 8];
@@ -149,12 +148,37 @@ static void harden(int32_t K, int32_t I)
     }
 }
 
+/* Let the noise set in late; a click in the errors; another primary path; a click in the
+ * references; a silence, and then a louder noise. */
+static void change(int32_t K, int32_t I)
+{
+    for (int32_t n = 0; n < SAMPLES; n++) {
+        const anc_real level = n < 500 ? 1 : n < 560 ? 0 : 16;
+        for (int32_t i = 0; i < I; i++) reference[i][n] *= n == 450 ? 64 : level;
+        for (int32_t k = 0; k < K; k++) {
+            disturbance[k][n] *= n < 70 ? 0 : n < 400 ? 1 : -level;
+            if (n == 350) disturbance[k][n] += 256;
+        }
+    }
+}
+
+/* Silence one of several loudspeakers and references; a single reference, at first. */
+static void silence(int32_t K, int32_t J, anc_real *path, anc_real *estimated)
+{
+    if (J == 1) memset(reference[0], 0, 80 * sizeof(anc_real));
+    if (J > 1) memset(reference[1], 0, sizeof reference[1]);
+    for (int32_t k = 0; J > 1 && k < K; k++)
+        for (int32_t m = 0, last = (k * J + J - 1) * PATH; m < PATH; m++)
+            path[last + m] = estimated[last + m] = 0;
+}
+
 /* Run an algorithm of a shape: plain; equipped with a guard, limiters, amplifiers, windows and
  * computed factors; on hard input; or paused. */
 static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
 {
     static const char *const kinds[] = {"plain", "equipped", "hard", "paused"};
     const int equipped = kind == EQUIPPED, paused = kind == PAUSED;
+    const int learns_paths = !strcmp(algorithms[number].name, "anc_power_budget");
     static anc_real estimated[MOST * MOST * PATH], path[MOST * MOST * PATH],
         feedback[MOST * MOST * PATH], guard[GUARD], settings[8 * MOST];
     static anc_real output[MOST * (4 * PATH + 64)], present[3 * MOST];
@@ -168,10 +192,11 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
                            .microphones = K,
                            .loudspeakers = J,
                            .references = I,
-                           .taps = TAPS,
+                           /* half the length of the transforms is a power of four, or not */
+                           .taps = learns_paths && equipped ? TAPS - 1 : TAPS,
                            .path_taps = PATH,
-                           /* KF-PB takes none */
-                           .guard_taps = equipped || (paused && K > 1) ? GUARD : 0,
+                           .guard_taps =
+                               !learns_paths && (equipped || (paused && K > 1)) ? GUARD : 0,
                            .modelled = paused,
                            .power_windows = equipped ? power_windows : NULL,
                            .limiter_windows = equipped ? windows : NULL,
@@ -217,7 +242,10 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int kind)
         for (int32_t k = 0; k < K; k++)
             disturbance[k][n] = (n < 6 ? 0 : reference[k % I][n - 6]) + noise() / 32;
     }
-    if (kind == HARD) harden(K, I);
+    if (kind == HARD)
+        harden(K, I, sizeof(anc_real) == sizeof(float) || learns_paths ? 4096 : 1e30f);
+    if (learns_paths && (equipped || paused)) change(K, I);
+    if (learns_paths && kind == HARD) silence(K, J, path, estimated);
     memset(signal, 0, sizeof signal), memset(output, 0, sizeof output),
         memset(present, 0, sizeof present);
 

@@ -46,12 +46,15 @@ EQUIPPED: dict[str, Mapping[str, float]] = {
     "mov": {"modified": 0.0},
     "mov_fixed": {"modified": 1.0},
     "kalman": {"fading": 1 + 2.0**-7},
+    "power_budget": {"block": 83.0, "averaging": 41.0, "memory": 1 - 2.0**-8, "spread": 0.0},
 }
 HARD: dict[str, Mapping[str, float]] = {
     "fxnlms": {"regularization": 0.0},
     "kalman": {"state_noise": 0.0, "measurement_noise": 0.0, "initial_variance": 2.0**10, "fading": 1 + 2.0**-3},
     "diagonal": {"state_noise": 0.0, "measurement_noise": 0.0, "initial_variance": 2.0**10},
+    "power_budget": {"block": 13.0},
 }
+PAUSED: dict[str, Mapping[str, float]] = {"power_budget": {"block": 5.0, "memory": 1 - 2.0**-7}}
 
 
 def exported(kind: str = "algorithm") -> list[str]:
@@ -114,7 +117,7 @@ def program(
     """Compile a program of tests/core with the sources of the core, or against a library, and return its path."""
 
     def row(name: str, plain: Mapping[str, float]) -> str:
-        each = [{**plain, **own.get(name, {})} for own in ({}, EQUIPPED, HARD, {})]
+        each = [{**plain, **own.get(name, {})} for own in ({}, EQUIPPED, HARD, PAUSED)]
         settings = [", ".join(f"(anc_real){value!r}" for value in one.values()) for one in each]
         return f"{{ALGORITHM({name}), {{{', '.join(f'{{{one}}}' for one in settings)}}}}}"
 

@@ -39,6 +39,13 @@ KALMAN = (
     "tests/filters/test_random_walk.py",
     *CONTROLLERS,
 )
+KF_PB = (
+    "(KF-PB or power_budget or posterior) and not limiter and not amplifier",
+    "tests/controllers/test_posterior_oracles.py",
+    "tests/controllers/test_power_budget.py",
+    "tests/controllers/test_power_budget_conditions.py",
+    *CONTROLLERS[1:],
+)
 LOOP = tuple(
     f"tests/loop/test_{name}.py"
     for name in ("loop", "channels", "changes_in_a_run", "simulation", "several_controllers")
@@ -46,6 +53,7 @@ LOOP = tuple(
 IN_C = "not frequency"  # whose filter is Python's
 TESTS = {  # which, as pytest's -k says it, and of which files
     "amplifier.c": (IN_C, "tests/power/test_amplifiers.py"),
+    "budget.c": KF_PB,
     "constraint.c": (IN_C, "tests/power/test_constraint.py", "tests/controllers/test_against_oracles.py"),
     "controller.c": (
         IN_C,
@@ -55,6 +63,7 @@ TESTS = {  # which, as pytest's -k says it, and of which files
     ),
     "covariance.c": KALMAN,
     "diagonal.c": ("kalman or diagonal", "tests/controllers/test_kalman_variants.py", *CONTROLLERS),
+    "fourier.c": KF_PB,
     "kalman.c": KALMAN,
     "limiter.c": (
         IN_C,
@@ -65,6 +74,7 @@ TESTS = {  # which, as pytest's -k says it, and of which files
     ),
     "lms.c": ("not KF and not RLS and not frequency", "tests/controllers/test_lms_family.py", *CONTROLLERS),
     "loop.c": (IN_C, *LOOP, *CONTROLLERS),
+    "posterior.c": KF_PB,
     "processor.c": (IN_C, "tests/core/test_building.py::test_the_level_is_that_of_the_features"),
     "signals.c": (
         IN_C,
