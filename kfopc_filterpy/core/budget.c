@@ -360,7 +360,7 @@ static void solve_filters(budget *f)
                            f->price[j] + REGULAR * f->gain[j], f->smooth_R + times(i * I + c, F->F),
                            F->F);
     factorise_spectra(F, f->factor, J * I);
-    approach(&own, f->b, f->now, FILTER_STEPS, 0);
+    approach(&own, f->b, f->now, FILTER_STEPS);
     for (int32_t i = 0; i < n; i++)
         if (!within(f->now[i], LARGEST_TAP)) {
             clear(f->now, (size_t)n);

@@ -253,7 +253,7 @@ void solve_circulants(const fourier *f, const real *factor, real *spectra, real 
     }
 }
 
-void approach(const equations *of, const real *b, real *v, int steps, real enough)
+void approach(const equations *of, const real *b, real *v, int steps)
 {
     const int32_t n = of->n;
     real *restrict r = of->work, *p = r + n, *z = p + n, *product = z + n;
@@ -261,7 +261,7 @@ void approach(const equations *of, const real *b, real *v, int steps, real enoug
     for (int32_t i = 0; i < n; i++) r[i] = b[i] - product[i];
     of->precondition(of->self, p, r);
     real energy = dot(r, p, n);
-    for (int step = 0; step < steps && energy > enough; step++) {
+    for (int step = 0; step < steps && energy > 0; step++) {
         of->multiply(of->self, product, p);
         const real bend = dot(p, product, n), a = bend > 0 ? energy / bend : 0;
         add_scaled(v, a, p, n);

@@ -65,7 +65,6 @@ typedef struct {
     real *work; /* (4, n); then the first n are b - A v */
 } equations;
 
-/* Take steps of conjugate gradients from v on, until what is missing, v' A v, is not more than
- * `enough`, about. */
-void approach(const equations *of, const real *b, real *v, int steps, real enough);
+/* Take steps of conjugate gradients from v on. */
+void approach(const equations *of, const real *b, real *v, int steps);
 #endif

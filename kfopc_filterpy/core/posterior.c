@@ -6,10 +6,8 @@
 static const real SURPRISE = 10;
 /* rms error over the path, if it gave way to an independent one of the same size: sqrt(2). */
 static const real REDRAWN = (real)1.4142135623730951;
-/* At most so many steps of conjugate gradients in a block, until what is missing is this share of
- * the doubt. */
+/* Steps of conjugate gradients in a block. */
 enum { PLANT_STEPS = 8 };
-static const real ENOUGH = (real)0.001;
 
 /* Correlations. Every sum is in the order of k, whatever the number of sums that are formed at
  * once. */
@@ -341,8 +339,7 @@ static void solve_row(posterior *f, int32_t row, real q)
 {
     const equations own = {f, multiply_posterior, precondition_posterior, f->C * f->N, f->vectors};
     set_right(f, row, q, f->counts[FRESH]);
-    approach(&own, f->right, taps_of(f, f->solution, row, 0), PLANT_STEPS,
-             ENOUGH * (row < f->K ? q : 1) * (real)f->n);
+    approach(&own, f->right, taps_of(f, f->solution, row, 0), PLANT_STEPS);
 }
 
 /* Approach the posterior of the data; return 0 if nothing can be told yet. */
@@ -578,20 +575,18 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     const real grown =
         known->expected > 0 ? known->missed / known->expected * is->expected / each : 0;
     const real noise = larger(mean_noise(f), grown);
-    if (is->missed > SURPRISE * noise * each &&
-        is->missed > SURPRISE * (noise + power_of_doubt(f)) * each) {
-        count_up(f->alarms);
-        known->spread = REDRAWN;
-        f->counts[WAITING] = 1;
-        /* If the control does no good, listen to p alone. */
-        f->counts[SILENT] = is->heard >= is->expected;
-        begin_data(f, 0);
-        return 0;
-    }
+    const int surprised = is->missed > SURPRISE * noise * each &&
+                          is->missed > SURPRISE * (noise + power_of_doubt(f)) * each;
     forget = raised(forget, f->B);
     known->missed = forget * known->missed + smaller(is->missed, is->expected);
     known->expected = forget * known->expected + is->expected;
-    return 1;
+    if (!surprised) return 1;
+    count_up(f->alarms);
+    known->spread = REDRAWN;
+    f->counts[WAITING] = 1;
+    f->counts[SILENT] = is->heard >= is->expected; /* the control does no good: listen to p alone */
+    begin_data(f, 0);
+    return 0;
 }
 
 /* Return the energy of a block of the signals from `begin` to `end`. */

@@ -46,7 +46,6 @@ WITHOUT = {  # the value with which a constant does nothing
     "SURPRISE": "1e9",
     "REDRAWN": "0.1",  # what is known before a surprise
     "PLANT_STEPS": "1",
-    "ENOUGH": "0",
 }
 CASES = (
     *(("duct", noise) for noise in ("compressor", "bursts", "swelling band noise", "recorded motor")),

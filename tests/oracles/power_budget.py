@@ -74,13 +74,13 @@ def preconditioner(R, n):
     return toeplitz((np.fft.ifft(np.linalg.inv(spectra.T).T) / turn).real, n)
 
 
-def conjugate_gradients(A, W, b, v, steps, enough=0.0):
-    """Return the rows v after steps towards v A = b with the preconditioner W, each until r W r' is `enough`."""
+def conjugate_gradients(A, W, b, v, steps):
+    """Return the rows v after steps towards v A = b with the preconditioner W."""
     r = b - v @ A
     p = r @ W
     rz = np.sum(r * p, axis=-1, keepdims=True)
     for _ in range(steps):
-        goes_on, nothing = rz > enough, np.zeros_like(rz)
+        goes_on, nothing = rz > 0, np.zeros_like(rz)
         Ap = p @ A
         bend = np.sum(p * Ap, axis=-1, keepdims=True)
         a = np.divide(rz, bend, where=goes_on & (bend > 0), out=nothing.copy())
@@ -178,14 +178,14 @@ class Plant:
             doubt = np.mean(self.q) * self.n / self.count
         else:
             doubt = np.mean(self.q) * np.sum((self.theta[self.K :] @ Z.T) ** 2) / (self.B * core.DRAWS)
-        if missed > core.SURPRISE * (noise + doubt):
+        surprised = missed > core.SURPRISE * (noise + doubt)
+        self.missed = self.forget * self.missed + min(missed, d2)
+        self.expected = self.forget * self.expected + d2
+        if surprised:
             self.spread, self.waiting, self.surprises = core.REDRAWN, True, self.surprises + 1
             self.silent = heard >= d2  # the control does no good: listen to p alone
             self.begin(z, 0)
-            return False
-        self.missed = self.forget * self.missed + min(missed, d2)
-        self.expected = self.forget * self.expected + d2
-        return True
+        return not surprised
 
     def add(self, Z, d, e, new):
         """Add the block, or its newest samples; if there are none, what the posterior expects: nothing changes then."""
@@ -221,13 +221,12 @@ class Plant:
         R[range(self.C), range(self.C), 0] += ridge[::N]
         weight = self.mask * np.tile(self.g ** (np.arange(N) / 2), self.C)
         W = preconditioner(R, N) * np.outer(weight, weight)
-        enough = core.ENOUGH * self.n * np.repeat([q, 1.0], [K, core.DRAWS])[:, None]
         A = self.G + np.diag(ridge)
         due = core.DRAWS if self.fresh else min(math.ceil(core.DRAWS * self.B / self.count), core.DRAWS)
         turns = (self.turn + np.arange(due)) % core.DRAWS
         solved = np.concatenate([np.arange(K), K + turns])  # not all draws: they change little
         pull, theta = (self.r + pull)[solved], self.theta[solved]
-        self.theta[solved] = conjugate_gradients(A, W, pull, theta, core.PLANT_STEPS, enough[solved])
+        self.theta[solved] = conjugate_gradients(A, W, pull, theta, core.PLANT_STEPS)
         self.turn = (self.turn + due) % core.DRAWS
         theta = self.theta[:K]
         residual = np.maximum(self.ee + np.sum(theta * (theta @ self.G - 2 * self.r[:K]), axis=1), 0.0)
