@@ -103,6 +103,16 @@ def test_a_rated_power_that_is_assigned_during_a_run_holds_from_then_on() -> Non
     assert np.mean(y[-round(3 * FS) :] ** 2) > 0.06
 
 
+def test_at_a_low_sample_rate_a_block_has_few_samples() -> None:
+    fs = 100.0  # three samples
+    x = np.random.default_rng(5).standard_normal(2000)
+    controller = made(fs=fs, rated_power=1.0)
+    result = simulate(controller, x, Plant(S, PRIMARY, fs=fs, sensor_noise_std=0.01), rng=1)
+    last = slice(-600, None)
+    assert noise_reduction_db(result.error[last], result.disturbance[last], steady=1.0) > 10.0
+    assert controller.alarms == 0
+
+
 # ---- Verification
 
 
