@@ -6,6 +6,9 @@
 static const real SURPRISE = 10;
 /* rms error over the path, if it gave way to an independent one of the same size: sqrt(2). */
 static const real REDRAWN = (real)1.4142135623730951;
+/* What is over before the last part of a block, of so many, is no other plant: a click, or a
+ * clipped peak. */
+enum { PARTS_OF_BLOCK = 8 };
 /* Steps of conjugate gradients in a block. */
 enum { PLANT_STEPS = 8 };
 
@@ -529,9 +532,15 @@ static void add_samples(posterior *f, int32_t newest, int believed, real expecte
     known->explained = share * known->explained + of_weights / (real)f->B * expected;
 }
 
-/* Energies of a block over the microphones: of what the posterior does not explain, of d^ and of
- * the errors. */
-typedef struct { real missed, expected, heard; } judgement;
+/* Return how many samples are the last part of a block. */
+static int32_t last_part(const posterior *f)
+{
+    return f->B - f->B * (PARTS_OF_BLOCK - 1) / PARTS_OF_BLOCK;
+}
+
+/* Energies of a block over the microphones: of what the posterior does not explain, in all and at
+ * last, of d^ and of the errors. */
+typedef struct { real missed, missed_at_last, expected, heard; } judgement;
 
 /* Judge a block. If s^ is exact, add what is played to the errors, because it teaches nothing. */
 static judgement judge(posterior *f)
@@ -550,6 +559,7 @@ static judgement judge(posterior *f)
         explain(f, f->theta + times(k, f->n), d, z);
         for (int32_t t = 0; t < B; t++) z[t] += error[t] - d[t];
         found.missed += dot(z, z, B);
+        found.missed_at_last += dot(z, z, last_part(f));
         found.expected += dot(d, d, B);
     }
     return found;
@@ -575,8 +585,12 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     const real grown =
         known->expected > 0 ? known->missed / known->expected * is->expected / each : 0;
     const real noise = larger(mean_noise(f), grown);
-    const int surprised = is->missed > SURPRISE * noise * each &&
-                          is->missed > SURPRISE * (noise + power_of_doubt(f)) * each;
+    int surprised = is->missed > SURPRISE * noise * each;
+    if (surprised) {
+        const real limit = SURPRISE * (noise + power_of_doubt(f));
+        surprised = is->missed > limit * each;
+        if (surprised && is->missed_at_last <= limit * (real)(last_part(f) * f->K)) return 0;
+    }
     forget = raised(forget, f->B);
     known->missed = forget * known->missed + smaller(is->missed, is->expected);
     known->expected = forget * known->expected + is->expected;

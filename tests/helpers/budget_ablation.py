@@ -45,6 +45,7 @@ WITHOUT = {  # the value with which a constant does nothing
     "LOUDER": "1e30",
     "SURPRISE": "1e9",
     "REDRAWN": "0.1",  # what is known before a surprise
+    "PARTS_OF_BLOCK": "1",
     "PLANT_STEPS": "1",
 }
 CASES = (

@@ -156,7 +156,7 @@ class Plant:
         Z = regressors(z, N)
         d = self.significant * self.theta[:K, : self.split] @ Z[:, : self.split].T
         if new and known and (self.exact or not played or self.taught > 0):
-            missed = np.mean((e - self.theta[:K] @ Z.T) ** 2)
+            missed = np.mean((e - self.theta[:K] @ Z.T) ** 2, axis=0)
             new = new if self.believes(missed, np.mean(d**2), heard, z, Z) else 0
         x2, y2 = (np.sum(z[part, -self.B :] ** 2) for part in (slice(I), slice(I, None)))
         x2_of_data, y2_of_data = self.energy_of(slice(I)), self.energy_of(slice(I, None))
@@ -178,7 +178,12 @@ class Plant:
             doubt = np.mean(self.q) * self.n / self.count
         else:
             doubt = np.mean(self.q) * np.sum((self.theta[self.K :] @ Z.T) ** 2) / (self.B * core.DRAWS)
-        surprised = missed > core.SURPRISE * (noise + doubt)
+        limit = core.SURPRISE * (noise + doubt)
+        last = self.B * (core.PARTS_OF_BLOCK - 1) // core.PARTS_OF_BLOCK
+        at_last, missed = np.mean(missed[last:]), np.mean(missed)
+        surprised = missed > limit
+        if surprised and at_last <= limit:
+            return False  # over already
         self.missed = self.forget * self.missed + min(missed, d2)
         self.expected = self.forget * self.expected + d2
         if surprised:
