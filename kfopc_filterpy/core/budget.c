@@ -21,8 +21,8 @@ static const anc_setting budget_settings[] = {{"rated_power", 1e-30f, 0, ANC_EAC
                                               {"spread", 0, 1000, ANC_ONE},
                                               {0}};
 
-/* Shares of the account: what is planned for a short time, a little more than all, since a noise
- * that fluctuates spends less; what is never exceeded, but clipped. */
+/* In ratings: the mean power that is planned for a short time, a little more than 1, since a noise
+ * that fluctuates spends less; the mean over the account beyond which samples are clipped. */
 static const real PLANNED = (real)1.02, MOST = (real)1.04;
 /* A noise may go on as in the window of x for this part of the averaging time, and as in the last
  * block for this one. */
@@ -55,13 +55,13 @@ typedef struct {
     real *price;              /* (J) */
     real *now;                /* (J, I, L) filters at these prices */
     real *lags;               /* (I, I, N) of the windows, into which the newest block fades in */
-    real *R_at, *smooth_R;    /* (I, I) spectra: of the lags, of the circulant nearest to them */
+    real *R_at, *smooth_R;    /* (I, I) spectra: of the lags, of a circulant near to them */
     real *short_at;           /* (I, I) spectra: of the short window */
     real *SS, *gain;          /* (J, J) spectra of the secondary paths; (J) mean of the diagonal */
     real *smooth_A, *factor;  /* (J, I, J, I) spectra: of the filtered references, and priced */
     real *b;                  /* (J, I, L) */
     real *spectra, *products; /* (J, I), (J, I) spectra */
-    real *vectors;            /* (5, J, I, L) */
+    real *vectors;            /* (4, J, I, L) */
     real *small;              /* (J + 5, J) see `solve_all` */
     real *window;             /* (I, B + N - 1) */
     real *work;               /* (2, width) */
@@ -82,7 +82,7 @@ static int takes(const anc_plan *p, real block, real averaging)
     if (!(B >= 1 && B <= 65536 && T >= 20 && T <= 100000 && N <= 1 << 20)) return 0;
     return (K + DRAWS) * (I + J) * N <= most && J * T <= most &&
            (I + J + K) * (2 * N + B) <= most && (I + J + 1) * (I + J) * spectrum <= most &&
-           J * I * J * I * spectrum <= most && 5 * J * I * L <= most;
+           J * I * J * I * spectrum <= most && 4 * J * I * L <= most;
 }
 
 static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
@@ -122,7 +122,7 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     f->b = reals(at, "with_disturbance", ANC_SCRATCH, 1, J, I, L);
     f->spectra = reals(at, "filter_spectra", ANC_SCRATCH, 1, J, I, spectrum);
     f->products = reals(at, "filter_products", ANC_SCRATCH, 1, J, I, spectrum);
-    f->vectors = reals(at, "filter_vectors", ANC_SCRATCH, 5, J, I, L);
+    f->vectors = reals(at, "filter_vectors", ANC_SCRATCH, 4, J, I, L);
     f->small = reals(at, "dual", ANC_SCRATCH, 1, 1, J + 5, J);
     f->window = reals(at, "windowed", ANC_SCRATCH, 1, 1, I, B + N - 1);
     f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, 2, f->width);
@@ -252,7 +252,7 @@ static void correlate_paths(budget *f)
     }
 }
 
-/* Set A = SS R, the circulant nearest to it, and b. */
+/* Set a circulant near to A = SS R, the gains, and b. */
 static void set_equations(budget *f)
 {
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
@@ -581,7 +581,7 @@ static void cut_clicks(budget *f)
 {
     for (int32_t i = 0; i < f->s.I; i++) {
         real *x = newest(&f->s.x, i);
-        if (!is_click(f, *x, f->peak + i)) continue;
+        if (!within(*x, anc_loudest_learnt) || !is_click(f, *x, f->peak + i)) continue;
         *x = *x < 0 ? -f->peak[i] : f->peak[i];
         f->posterior.heard[HEARD] = -1 - f->posterior.heard[FILLED];
     }

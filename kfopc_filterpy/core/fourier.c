@@ -134,7 +134,7 @@ static real *transform_complex(const fourier *f, real *a, real *b)
 void transform(const fourier *f, real *spectrum, const real *from, int32_t n)
 {
     const int32_t H = f->half;
-    real *restrict re = scratch_row(f, 0), *restrict im = re + H;
+    real *re = scratch_row(f, 0), *im = re + H;
     const real *restrict c = cosines(f, f->F), *restrict d = sines(f, f->F);
     int32_t k = 0;
     for (; k < n - H; k++) {
@@ -154,12 +154,12 @@ void transform_back(const fourier *f, real *to, const real *spectrum)
     const int32_t H = f->half;
     const real scale = 2 / (real)f->F;
     const real *restrict c = cosines(f, f->F), *restrict d = sines(f, f->F);
-    real *restrict a = scratch_row(f, 0); /* with its parts exchanged, a transform is the inverse */
+    real *a = scratch_row(f, 0); /* with its parts exchanged, a transform is the inverse */
     for (int32_t k = 0; k < H; k++) {
         a[k] = spectrum[H + k] * scale;
         a[H + k] = spectrum[k] * scale;
     }
-    const real *restrict Z = transform_complex(f, a, scratch_row(f, 1));
+    const real *Z = transform_complex(f, a, scratch_row(f, 1));
     for (int32_t k = 0; k < H; k++) {
         to[k] = Z[H + k] * c[k] - Z[k] * d[k];
         to[H + k] = -Z[H + k] * d[k] - Z[k] * c[k];
@@ -200,7 +200,7 @@ void factorise_spectra(const fourier *f, real *A, int32_t n)
     const size_t each = (size_t)f->F;
     real *least = scratch_row(f, 2);
     for (int32_t i = 0; i < n; i++) {
-        real *row = A + times(i, n) * each, *restrict diagonal = row + (size_t)i * each;
+        real *row = A + times(i, n) * each, *diagonal = row + (size_t)i * each;
         for (int32_t k = 0; k < f->half; k++) least[k] = SINGULAR * diagonal[k];
         for (int32_t c = 0; c <= i; c++) {
             real *at = row + (size_t)c * each;

@@ -1,8 +1,8 @@
 /* Fourier transforms of real numbers, and what can be done with them: sums of products at all lags,
  * and systems of Toeplitz equations whose lags are of both signs. F, a power of two, holds 2N of
- * them. The frequencies are odd: (4 j + 1) pi / F, j < F / 2, and with the conjugates all odd
- * multiples of pi / F. A spectrum is F / 2 real parts, and after them as many imaginary ones; what
- * products wrap around changes its sign, and circulants are skew. */
+ * them. The frequencies are odd multiples of pi / F: (4 j + 1) pi / F, j < F / 2; their
+ * conjugates are the other odd multiples. A spectrum is F / 2 real parts, and after them as many
+ * imaginary ones. What wraps around in a product changes its sign, so circulants are skew. */
 #ifndef FOURIER_H
 #define FOURIER_H
 #include "signals.h"
@@ -28,8 +28,8 @@ void transform_back(const fourier *f, real *to, const real *spectrum);
 /* Add sum_k u(k) v(k + l), k < n, to to_l, l < lags; lags <= F / 2. */
 void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *v, int32_t lags);
 /* Set a spectrum to that of ahead_l at lags l and behind_l at lags -l, l < n, under a triangle that
- * ends at lag n if `smooth`: then Toeplitz matrices that are definite become circulants that are.
- * The matrix nearest to a Toeplitz one: T. Chan, SIAM J. Sci. Stat. Comput. 9 (1988) 766. */
+ * ends at lag n if `smooth`: then a definite Toeplitz matrix gives a definite circulant near to it,
+ * as that of T. Chan, SIAM J. Sci. Stat. Comput. 9 (1988) 766. */
 void transform_lags(const fourier *f, real *spectrum, const real *ahead, const real *behind,
                     int32_t n, int smooth);
 

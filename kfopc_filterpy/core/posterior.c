@@ -6,8 +6,8 @@
 static const real SURPRISE = 10;
 /* rms error over the path, if it gave way to an independent one of the same size: sqrt(2). */
 static const real REDRAWN = (real)1.4142135623730951;
-/* What is over before the last part of a block, of so many, is no other plant: a click, or a
- * clipped peak. */
+/* An error that is over before the last of so many parts of a block is a click or a clipped peak,
+ * not another plant. */
 enum { PARTS_OF_BLOCK = 8 };
 /* Steps of conjugate gradients in a block. */
 enum { PLANT_STEPS = 8 };
@@ -178,13 +178,16 @@ static int set_prior(posterior *f)
         q += f->q[k];
     }
     if (!(x2 > 0)) return 0;
-    known->prior_s = (real)f->M / (known->spread * known->spread * size_of_path(f));
+    const real spread = known->spread;
+    known->prior_s = f->exact ? 0 : (real)f->M / (spread * spread * size_of_path(f));
     known->prior = x2 * (real)f->N * (real)f->K / (e2 + known->explained);
     for (int32_t k = 0; q == 0 && k < f->K; k++) f->q[k] = (real)1e-3 * f->ee[k] / known->samples;
     return 1;
 }
 
-/* Set `to` to E'E t or S'S t off the Toeplitz product: the part of it at `from` to N - 1 lags. */
+/* Take E'E t or S'S t off `out`, the spectra of T t. T: spectra of t; edge: spectra of the samples
+ * at that end; only the products at lags from `from` to `until` - 1 count. `turn` is -1 for the
+ * samples before the first row. */
 static void leave_out(posterior *f, const real *edge, const real *T, real *out, int32_t from,
                       int32_t until, real turn)
 {
@@ -277,6 +280,7 @@ static void set_right(posterior *f, int32_t row, real q, int first)
             right[i] = r[i] + pull;
             if (first) t[i] = ridge > 0 ? pull / (ridge * f->taper[i] * f->taper[i]) : 0;
         }
+        for (int32_t i = taps_in(f, c); i < f->N; i++) right[i] = 0;
     }
 }
 
@@ -356,7 +360,8 @@ static int approach_posterior(posterior *f)
         solve_row(f, k, q);
         f->next_q[k] = noise_of(f, k, q, f->vectors);
     }
-    /* Draws take turns: each is solved again before a share of the data, of 1 / draws, is new. */
+    /* Draws take turns: all are solved again by the time that as many samples are new as the data
+     * stand for. */
     for (int32_t i = 0; i < draws && (f->counts[FRESH] || (real)i < renewed); i++) {
         solve_row(f, f->K + f->counts[TURN], q);
         f->counts[TURN] = (f->counts[TURN] + 1) % draws;
@@ -364,8 +369,8 @@ static int approach_posterior(posterior *f)
     copy(f->q, f->next_q, (size_t)f->K);
     /* Draws are over sqrt(q). If q rises, they keep their size, until they are solved with it. */
     const real scale = smaller(root(q / mean_noise(f)), 1);
-    real *unit = taps_of(f, f->solution, f->K, 0);
-    for (int32_t i = 0; scale < 1 && i < draws * f->C * f->N; i++) unit[i] *= scale;
+    real *drawn = taps_of(f, f->solution, f->K, 0);
+    for (int32_t i = 0; scale < 1 && i < draws * f->C * f->N; i++) drawn[i] *= scale;
     keep_significant(f);
     set_theta(f);
     count_up(f->fits);
@@ -408,8 +413,8 @@ static void explain(const posterior *f, const real *theta, real *d, real *z)
     }
 }
 
-/* Return the mean power over a block of what the draws say the errors may be; without draws, of
- * what n unknown taps are worth. */
+/* Return the mean power of the doubt in a block: that of the draws; without draws, what n unknown
+ * taps add. */
 static real power_of_doubt(const posterior *f)
 {
     const real q = mean_noise(f);
@@ -621,9 +626,8 @@ static void learn_samples(posterior *f, int32_t newest, real forget)
     const judgement is = judge(f);
     int32_t believed = newest;
     /* Judged is what was fitted to data that include the loudspeakers, unless they are silent. */
-    if (newest && known && (f->exact || f->numbers->taught > 0 || !is_loud(f)) &&
-        !notice_surprise(f, &is, forget))
-        believed = 0;
+    const int judged = f->exact ? f->numbers->samples > 0 : f->numbers->taught > 0 || !is_loud(f);
+    if (newest && known && judged && !notice_surprise(f, &is, forget)) believed = 0;
     const real x2 = energy_of_block(f, 0, f->I), y2 = energy_of_block(f, f->I, f->C);
     const real x2_of_data = energy_of_data(f, 0, f->I), y2_of_data = energy_of_data(f, f->I, f->C);
     if (believed) {

@@ -1,7 +1,7 @@
 """Print what breaks without each constant of KF-PB: ``python tests/helpers/budget_ablation.py [constant ...]``.
 
-In a copy of the package, a constant of the C core gets a value that makes it do nothing. Then KF-PB runs through the events
-and ten noises of its studies, and with three loudspeakers.
+In a copy of the package, a constant of the C core gets a value that takes it out of effect, or makes it small. Then KF-PB runs through the events
+and ten noises of its studies, with three loudspeakers, and with an amplifier that clips peaks.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ if __name__ == "__main__" and "PYTHONPATH" not in os.environ:
 from comparisons.studies import events  # noqa: E402
 from comparisons.studies import kf_pb_cases as study  # noqa: E402
 from comparisons.studies.cases import FS  # noqa: E402
-from kfopc_filterpy import Plant, kf_pb, noise_reduction_db, simulate  # noqa: E402
+from kfopc_filterpy import HardClipAmplifier, Plant, kf_pb, noise_reduction_db, simulate  # noqa: E402
 from kfopc_filterpy.core.library import load  # noqa: E402
 from kfopc_filterpy.metrics import overshoot  # noqa: E402
 
-WITHOUT = {  # the value with which a constant does nothing
+WITHOUT = {  # the value that takes a constant out of effect, or makes it as small as is sensible
     "PLANNED": "1",
     "MOST": "1e9",
     "WINDOW_LASTS": "20",  # no longer than the block's power
@@ -81,6 +81,17 @@ def three_loudspeakers() -> tuple[float, float]:
     return noise_reduction_db(run.error[:, fs:], d[:, fs:], steady=1.0), float(np.max(power))
 
 
+def clipped_peaks() -> tuple[float, float, int]:
+    """Return noise reduction, power and alarms with just enough power, and an amplifier that clips the highest peaks."""
+    own = events.event("start, ample power")
+    fs, rated = own.plant.fs, 0.42 * own.settings["rated_power"]  # which full control takes
+    plant = Plant(events.SECONDARY, amplifier=HardClipAmplifier(3 * rated**0.5), fs=fs)
+    controller = kf_pb(events.N_TAPS, Plant(events.SECONDARY, fs=fs), rated_power=rated)
+    run = simulate(controller, own.reference, plant, disturbance=own.disturbance)
+    heard = run.error[round(fs) :], own.disturbance[round(fs) :]
+    return noise_reduction_db(*heard, steady=1.0), float(run.output_power) / rated, int(controller.alarms)
+
+
 def measure(made: Path) -> dict[str, Any]:
     """Return the figures of all runs."""
     rows = [events.event_row(name) for name in events.EVENTS]
@@ -92,6 +103,7 @@ def measure(made: Path) -> dict[str, Any]:
         power = overshoot(run.control_signal, case.rated_power, FS, window_s=10.0)
         of_cases[name] = case.reduction_db(run.error), power, int(controller.alarms)
     of_cases["three loudspeakers"] = *three_loudspeakers(), 0
+    of_cases["clipped peaks"] = clipped_peaks()
     return {"events": of_events, "cases": of_cases}
 
 

@@ -155,7 +155,7 @@ class Plant:
             return
         Z = regressors(z, N)
         d = self.significant * self.theta[:K, : self.split] @ Z[:, : self.split].T
-        if new and known and (self.exact or not played or self.taught > 0):
+        if new and known and (self.count > 0 if self.exact else not played or self.taught > 0):
             missed = np.mean((e - self.theta[:K] @ Z.T) ** 2, axis=0)
             new = new if self.believes(missed, np.mean(d**2), heard, z, Z) else 0
         x2, y2 = (np.sum(z[part, -self.B :] ** 2) for part in (slice(I), slice(I, None)))
