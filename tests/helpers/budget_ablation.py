@@ -145,7 +145,7 @@ HEADING = f"""\
 Against the law as it is: the most that is lost in a second, from the second one after an event on (dB), and in which event; the
 change of the noise reduction of the noises, on average and at worst (dB), and of which. Loudest 100 ms of all events (dB); power
 over any averaging time, and alarms, of all events and of all noises.
-{"without":13}{"lost":>6} {"event":35}{"100 ms":>6}{"power":>7}{"":4}{"mean":>7}{"worst":>7} {"noise":44}{"power":>6}"""
+{"without":15}{"lost":>6} {"event":35}{"100 ms":>6}{"power":>7}{"":4}{"mean":>7}{"worst":>7} {"noise":44}{"power":>6}"""
 
 
 def line(constant: str, own: dict[str, Any], usual: dict[str, Any]) -> str:
@@ -157,7 +157,7 @@ def line(constant: str, own: dict[str, Any], usual: dict[str, Any]) -> str:
     power = max(row[2] for row in own["events"].values()), max(row[1] for row in own["cases"].values())
     alarms = sum(row[3] for row in own["events"].values()), sum(row[2] for row in own["cases"].values())
     return (
-        f"{constant or 'nothing':13}{lost[event]:6.1f} {event:35}{tenth:6.1f}{power[0]:7.3f}{alarms[0]:4}"
+        f"{constant or 'nothing':15}{lost[event]:6.1f} {event:35}{tenth:6.1f}{power[0]:7.3f}{alarms[0]:4}"
         f"{np.mean(list(gained.values())):+7.2f}{gained[case]:+7.2f} {case:44}{power[1]:6.3f}{alarms[1]:4}"
     )
 
