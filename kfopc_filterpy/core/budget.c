@@ -79,7 +79,7 @@ static int takes(const anc_plan *p, real block, real averaging)
     const double K = p->microphones, J = p->loudspeakers, I = p->references;
     const double L = p->taps, M = p->path_taps, N = L + M - 1, spectrum = 4 * N + 2;
     if (p->guard_taps || p->scenarios != 1) return 0;
-    if (!(B >= 1 && B <= 65536 && T >= 20 && T <= 100000 && N <= 1 << 20)) return 0;
+    if (!(B >= 1 && B <= 65536 && T >= BLOCK_LASTS && T <= 100000 && N <= 1 << 20)) return 0;
     return (K + DRAWS) * (I + J) * N <= most && J * T <= most &&
            (I + J + K) * (2 * N + B) <= most && (I + J + 1) * (I + J) * spectrum <= most &&
            J * I * J * I * spectrum <= most && 4 * J * I * L <= most;
@@ -128,20 +128,14 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, 2, f->width);
 }
 
-/* Return what loudspeaker j has spent in the newest n blocks, in blocks of the rating. */
-static real spent_by(const budget *f, int32_t j, int32_t n)
-{
-    real spent = 0;
-    for (int32_t t = 0; t < n; t++) spent += f->book[times(t, f->s.J) + (size_t)j];
-    return spent;
-}
-
 /* Set what each loudspeaker may spend in the next block, whatever its filter asks for. */
 static void set_room(budget *f)
 {
     const int32_t J = f->s.J;
     for (int32_t j = 0; j < J; j++) {
-        const real left = larger(MOST * (real)f->T - spent_by(f, j, f->T), 0);
+        real spent = 0;
+        for (int32_t t = 0; t < f->T; t++) spent += f->book[times(t, J) + (size_t)j];
+        const real left = larger(MOST * (real)f->T - spent, 0);
         f->asked[2 * J + j] = left * (real)f->posterior.B * f->s.setting[RATED_POWER][j];
     }
 }
@@ -155,7 +149,6 @@ static void start_budget(anc_view *view)
 }
 
 static real *work_row(const budget *f, int32_t row) { return f->work + times(row, f->width); }
-static int32_t all_taps(const budget *f) { return f->s.J * f->s.I * f->s.L; }
 
 /* The references. */
 
@@ -349,7 +342,7 @@ static void precondition_filters(void *self, real *to, const real *r)
 /* Go some steps from the last filters towards those at the prices. */
 static void solve_filters(budget *f)
 {
-    const int32_t I = f->s.I, J = f->s.J, n = all_taps(f);
+    const int32_t I = f->s.I, J = f->s.J, n = J * I * f->s.L;
     const fourier *F = &f->posterior.fourier;
     const equations own = {f, multiply_filters, precondition_filters, n, f->vectors};
     copy(f->factor, f->smooth_A, times(J * I * J * I, F->F));

@@ -195,6 +195,12 @@ void transform_lags(const fourier *f, real *spectrum, const real *ahead, const r
     transform(f, spectrum, lags, f->F);
 }
 
+static void scale_spectrum(const fourier *f, real *restrict x, const real *restrict by)
+{
+    for (int32_t k = 0; k < f->half; k++) x[k] *= by[k];
+    for (int32_t k = 0; k < f->half; k++) x[f->half + k] *= by[k];
+}
+
 void factorise_spectra(const fourier *f, real *A, int32_t n)
 {
     const size_t each = (size_t)f->F;
@@ -207,20 +213,11 @@ void factorise_spectra(const fourier *f, real *A, int32_t n)
             const real *other = A + times(c, n) * each;
             for (int32_t k = 0; k < c; k++)
                 add_product(f, at, other + (size_t)k * each, row + (size_t)k * each, -1, -1);
-            if (c == i) continue;
-            const real *restrict inverse = other + (size_t)c * each;
-            for (int32_t k = 0; k < f->half; k++) at[k] *= inverse[k];
-            for (int32_t k = 0; k < f->half; k++) at[f->half + k] *= inverse[k];
+            if (c < i) scale_spectrum(f, at, other + (size_t)c * each);
         }
         for (int32_t k = 0; k < f->half; k++)
             diagonal[k] = diagonal[k] > least[k] ? 1 / root(diagonal[k]) : 0;
     }
-}
-
-static void scale_spectrum(const fourier *f, real *restrict x, const real *restrict by)
-{
-    for (int32_t k = 0; k < f->half; k++) x[k] *= by[k];
-    for (int32_t k = 0; k < f->half; k++) x[f->half + k] *= by[k];
 }
 
 void solve_spectra(const fourier *f, const real *factor, real *x, int32_t n)

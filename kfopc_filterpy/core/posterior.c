@@ -56,7 +56,6 @@ void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, 
     f->C = C;
     f->rows = rows;
     f->history = N + block;
-    f->width = N + block;
     f->path = s->path;
     layout_fourier(&f->fourier, N, at);
     const int32_t spectrum = f->fourier.F;
@@ -86,10 +85,10 @@ void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, 
     f->faded = reals(at, "faded", ANC_SCRATCH, 1, 1, C, block + N - 1);
     f->right = reals(at, "right_side", ANC_SCRATCH, 1, 1, C, N);
     f->vectors = reals(at, "posterior_vectors", ANC_SCRATCH, 1, 4, C, N);
-    f->work = reals(at, "posterior_work", ANC_SCRATCH, 1, 1, POSTERIOR_ROWS, f->width);
+    f->work = reals(at, "posterior_work", ANC_SCRATCH, 1, 1, POSTERIOR_ROWS, f->history);
 }
 
-static real *work_of(const posterior *f, int32_t row) { return f->work + times(row, f->width); }
+static real *work_of(const posterior *f, int32_t row) { return f->work + times(row, f->history); }
 
 /* Return the taps of signal c in a row of vectors. */
 static real *taps_of(const posterior *f, real *vectors, int32_t row, int32_t c)
@@ -266,7 +265,7 @@ static void prepare(posterior *f, real q)
 }
 
 /* Set the right side of a row, r + q P mean; at the first fit to new data, begin with the prior. */
-static void set_right(posterior *f, int32_t row, real q, int first)
+static void set_right(posterior *f, int32_t row, real q)
 {
     for (int32_t c = 0; c < f->C; c++) {
         const real *r = taps_of(f, f->r, row, c), ridge = q * precision_of(f, c);
@@ -278,7 +277,7 @@ static void set_right(posterior *f, int32_t row, real q, int first)
                               : given ? ridge * f->taper[i] * given[i]
                                       : 0;
             right[i] = r[i] + pull;
-            if (first) t[i] = ridge > 0 ? pull / (ridge * f->taper[i] * f->taper[i]) : 0;
+            if (f->counts[FRESH]) t[i] = ridge > 0 ? pull / (ridge * f->taper[i] * f->taper[i]) : 0;
         }
         for (int32_t i = taps_in(f, c); i < f->N; i++) right[i] = 0;
     }
@@ -345,7 +344,7 @@ static real energy_of_data(const posterior *f, int32_t begin, int32_t end)
 static void solve_row(posterior *f, int32_t row, real q)
 {
     const equations own = {f, multiply_posterior, precondition_posterior, f->C * f->N, f->vectors};
-    set_right(f, row, q, f->counts[FRESH]);
+    set_right(f, row, q);
     approach(&own, f->right, taps_of(f, f->solution, row, 0), PLANT_STEPS);
 }
 
@@ -655,9 +654,15 @@ void learn(posterior *f, real forget)
     learn_samples(f, newest, forget);
 }
 
+/* Return the factor on a row such that sums over rows are expectations. */
+static real scale_of(const posterior *f, int32_t row)
+{
+    return row < f->K ? 1 : root((real)f->K / (real)DRAWS * mean_noise(f));
+}
+
 void secondary_of(const posterior *f, int32_t row, int32_t j, real *to)
 {
-    const real scale = row < f->K ? 1 : root((real)f->K / (real)DRAWS * mean_noise(f));
+    const real scale = scale_of(f, row);
     if (f->exact) {
         copy(to, given_path(f, row, f->I + j), (size_t)f->M);
         return;
@@ -668,7 +673,7 @@ void secondary_of(const posterior *f, int32_t row, int32_t j, real *to)
 
 void primary_of(const posterior *f, int32_t row, int32_t i, real *to)
 {
-    const real scale = row < f->K ? 1 : root((real)f->K / (real)DRAWS * mean_noise(f));
+    const real scale = scale_of(f, row);
     const real *t = taps_of(f, f->solution, row, i);
     for (int32_t m = 0; m < f->N; m++) to[m] = f->numbers->significant * scale * t[m] * f->taper[m];
 }

@@ -1,7 +1,8 @@
 """Print what breaks without each constant of KF-PB: ``python tests/helpers/budget_ablation.py [constant ...]``.
 
-In a copy of the package, a constant of the C core gets a value that takes it out of effect, or makes it small. Then KF-PB runs through the events
-and ten noises of its studies, with three loudspeakers, and with an amplifier that clips peaks.
+In a copy of the package, a constant of the C core gets a value that takes it out of effect, or makes it small. Then
+KF-PB runs through the events and ten noises of its studies, with three loudspeakers, and with an amplifier that clips
+peaks.
 """
 
 from __future__ import annotations
