@@ -35,14 +35,15 @@ def test_fxrls_is_the_weighted_least_squares(forgetting: float) -> None:
     np.testing.assert_allclose(controller.weights, np.linalg.solve(normal, H.T @ (weight * d)), rtol=0, atol=1e-10)
 
 
-def test_two_bad_samples_stop_no_forgetting() -> None:
-    """One reference is 1e4 times as loud for two samples: 1e8 times the variance is left along the others.
+@pytest.mark.parametrize("bad", [2, 9])
+def test_a_few_bad_samples_stop_no_forgetting(bad: int) -> None:
+    """One reference is 1e4 times as loud for some samples: 1e8 times the variance is left along the others.
 
     The filter with fading memory remains the weighted least squares of the test above.
     """
     forgetting, rng = 0.99, np.random.default_rng(0)
     H, noise = rng.standard_normal((300, 3)), 0.1 * rng.standard_normal(300)
-    H[200:202] = [1e4, 0.0, 0.0]
+    H[200 : 200 + bad] = [1e4, 0.0, 0.0]
     d = H @ [1.0, -0.5, 0.3] + noise
     settings = {"state_noise": 0.0, "measurement_noise": 1.0, "initial_variance": 1.0, "fading": 1.0 / forgetting}
     block = Block(Algorithm("kalman"), Shape(1, 1, 3, 1, 1), path=np.ones(1), settings=settings)
@@ -57,21 +58,49 @@ def test_two_bad_samples_stop_no_forgetting() -> None:
     np.testing.assert_allclose(block.fields["weights"].ravel(), expected, rtol=0, atol=1e-10)
 
 
-def test_what_was_loud_once_is_forgotten() -> None:
-    """After 200 samples that were 1e4 times as loud, P grows until FxRLS is the weighted least squares again.
+@pytest.mark.parametrize(
+    ("n", "past"),
+    [(3000, lambda x: 1e4 * x), (700, lambda x: 0.01 * np.sin(0.3 * np.arange(x.size)))],
+    ids=["loud", "tone"],
+)
+def test_what_was_loud_or_a_tone_once_is_forgotten(n: int, past: Any) -> None:
+    """P's largest variance is over 1e4 times the usual one; later, FxRLS is the weighted least squares again.
 
-    It takes 2800 samples here; the memory is of 10.
+    It takes 2800 samples after what was loud, 400 after the tone; the memory is of 10.
     """
-    n, forgetting, rng = 3000, 0.9, np.random.default_rng(0)
+    forgetting, rng = 0.9, np.random.default_rng(0)
     x, noise = rng.standard_normal((2, n))
-    x[:200] *= 1e4
+    x[:200] = past(x[:200])
     d = np.convolve(x, [1.0, -0.5, 0.3])[:n] + 0.1 * noise
-    d[1000:] *= -1.0
-    controller = fx_rls(L, [1.0], forgetting=forgetting)
+    d[n // 3 :] *= -1.0
+    controller = fx_rls(L, [1.0], forgetting=forgetting, initial_variance=1e8)
     simulate(controller, x, Plant([1.0], fs=FS), disturbance=d)
     H, weight = toeplitz(x, np.zeros(L)), forgetting ** np.arange(n - 1, -1, -1.0)
     expected = np.linalg.solve(H.T @ (weight[:, None] * H), H.T @ (weight * d))
     np.testing.assert_allclose(controller.weights, expected, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("gain", [2.0**-12, 2.0**12])
+def test_to_fxrls_no_level_is_soft_or_loud(gain: float) -> None:
+    """A reference g x from a variance of 1/g^2 gives weights w/g, to the bit: silence, a tone, noise, then the end of it."""
+    n = np.arange(2000)
+    x = np.r_[np.zeros(40), np.sin(0.3 * n), signals()[0], np.zeros(40), np.full(400, 1e-5)]
+    d = signals(x.size)[1]
+    one, other = (fx_rls(L, [1.0], forgetting=0.9, initial_variance=0.5 / g**2) for g in (1.0, gain))
+    one.process(x, d), other.process(gain * x, d)
+    np.testing.assert_array_equal(one.weights, gain * other.weights)
+    np.testing.assert_array_equal(one.covariance, gain**2 * other.covariance)
+
+
+@pytest.mark.parametrize("variance", [0.25, 4.0])
+def test_before_the_first_sound_fxrls_variance_grows_a_million_times(variance: float) -> None:
+    """To 2^20; what is softer than 1e-10 / variance counts as silence, and of what is louder P is (1 - lambda)/x^2."""
+    for energy, expected in ((0.5e-10, 2.0**20), (2e-10, 0.5 / 2e-10)):
+        controller = fx_rls(1, [1.0], forgetting=0.5, initial_variance=variance)
+        controller.process(np.zeros(40), np.zeros(40))
+        assert controller.covariance == variance * 2.0**20
+        controller.process(np.full(60, np.sqrt(energy / variance)), np.zeros(60))
+        assert controller.covariance == pytest.approx(variance * expected, rel=0.01)  # a little is learned of it
 
 
 def test_along_a_tone_fxrls_forgets_and_elsewhere_its_variance_stays() -> None:
