@@ -188,15 +188,17 @@ def test_from_silence_nothing_is_learned() -> None:
 
 
 def test_a_large_step_takes_no_more_than_the_whole_error_or_control_signal() -> None:
-    made = fx_lms(1, [1.0], step_size=1.0)
-    made.control_signal(1e15)
-    made.update(1e25)
-    np.testing.assert_allclose(made.weights, [1e10], rtol=1e-12)
-    made = mov_fx_lms(1, [[[1.0], [1.0]]], step_size=1e-3, penalty_factor=[0.0, 1e30])
-    for error in (1.0, 0.0):
-        made.control_signal(1.0)
-        made.update([error])
-    np.testing.assert_allclose(made.weights.ravel(), [1e-3, 0.0], atol=1e-18)
+    for x in (1e15, 1.2, 0.8):  # the last step is shorter than that
+        made = fx_lms(1, [1.0], step_size=1.0)
+        made.control_signal(x)
+        made.update(1e25)
+        np.testing.assert_allclose(made.weights, [min(1.0, 1.0 / x**2) * 1e25 * x], rtol=1e-12)
+    for x in (0.5, 2.0):
+        made = mov_fx_lms(1, [[[1.0], [1.0]]], step_size=1e-3, penalty_factor=[0.0, 1e30])
+        for error in (1.0, 0.0):
+            made.control_signal(x)
+            made.update([error])
+        np.testing.assert_allclose(made.weights.ravel(), [1e-3 * x, 0.0], atol=1e-18)
 
 
 @pytest.mark.parametrize("loud", [0, 1])
