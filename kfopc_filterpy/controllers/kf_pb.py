@@ -36,7 +36,7 @@ POSTERIOR = (
     "error_energy",
     "before_data",
     "solution",
-    "prior_draws",
+    "prior",
 )
 
 
@@ -73,11 +73,10 @@ class PowerBudgetInCore(CoreController):
     def _means(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the posterior means as the core has them, (K, I, N) and (K, J, M)."""
         fields = self._block.fields
-        theta, given = fields["theta"].reshape(self.n_microphones, -1), fields["secondary_path"][0]
-        learned = given[0].size if fields["spread"].item() > 0.0 else 0  # taps of secondary paths, the last in theta
-        n = theta.shape[1] - learned
-        primary = theta[:, :n].reshape(self.n_microphones, -1, self.n_taps + given.shape[-1] - 1)
-        return primary, theta[:, n:].reshape(given.shape) if learned else given
+        theta, given = fields["theta"][0], fields["secondary_path"][0]
+        learned = self.n_loudspeakers if fields["spread"].item() > 0.0 else 0  # the last signals in theta
+        references = theta.shape[1] - learned
+        return theta[:, :references], theta[:, references:, : given.shape[-1]] if learned else given
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Begin the posterior anew around the new path; the control filter, the account and the signals stay."""

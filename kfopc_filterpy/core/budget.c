@@ -62,10 +62,9 @@ typedef struct {
     real *b;                  /* (J, I, L) */
     real *spectra, *products; /* (J, I), (J, I) spectra */
     real *vectors;            /* (4, J, I, L) */
-    real *small;              /* (J + 5, J) see `solve_all` */
+    real *small;              /* (4, J) slopes, and see `solve_all` */
     real *window;             /* (I, B + N - 1) */
-    real *work;               /* (2, width) */
-    int32_t width;
+    real *work;               /* (B + N) of a path, or of a block */
 } budget;
 typedef char budget_fits_into_a_view[sizeof(budget) <= sizeof(anc_view) ? 1 : -1];
 
@@ -101,7 +100,6 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     const int32_t I = s->I, L = s->L, N = f->posterior.N, B = f->posterior.B;
     const int32_t spectrum = f->posterior.fourier.F;
     f->T = (int32_t)averaging;
-    f->width = N + B;
     f->asked = reals(at, "asked", ANC_STATE, 1, 1, 3, J);
     f->peak = reals(at, "peaks", ANC_STATE, 1, 1, 1, I + s->K);
     f->controlled = int32s(at, "controlled", ANC_STATE, 1);
@@ -123,9 +121,9 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     f->spectra = reals(at, "filter_spectra", ANC_SCRATCH, 1, J, I, spectrum);
     f->products = reals(at, "filter_products", ANC_SCRATCH, 1, J, I, spectrum);
     f->vectors = reals(at, "filter_vectors", ANC_SCRATCH, 4, J, I, L);
-    f->small = reals(at, "dual", ANC_SCRATCH, 1, 1, J + 5, J);
+    f->small = reals(at, "dual", ANC_SCRATCH, 1, 1, 4, J);
     f->window = reals(at, "windowed", ANC_SCRATCH, 1, 1, I, B + N - 1);
-    f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, 2, f->width);
+    f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, 1, B + N);
 }
 
 /* Set what each loudspeaker may spend in the next block, whatever its filter asks for. */
@@ -147,8 +145,6 @@ static void start_budget(anc_view *view)
     for (size_t n = 0; n < times(f->T, f->s.J); n++) f->book[n] = 1; /* spent before the start */
     set_room(f);
 }
-
-static real *work_row(const budget *f, int32_t row) { return f->work + times(row, f->width); }
 
 /* The references. */
 
@@ -223,12 +219,12 @@ static void correlate_paths(budget *f)
     const int32_t I = f->s.I, J = f->s.J, M = f->s.M, N = f->posterior.N;
     const fourier *F = &f->posterior.fourier;
     const size_t each = (size_t)F->F;
-    real *path = work_row(f, 0), *P = scratch_row(F, 4);
+    real *path = f->work, *P = scratch_row(F, 4);
     clear(f->SS, times(J * J, F->F));
     clear(f->products, times(J * I, F->F));
     for (int32_t row = 0; row < f->posterior.rows; row++) {
         for (int32_t j = 0; j < J; j++) {
-            secondary_of(&f->posterior, row, j, path);
+            path_of(&f->posterior, row, I + j, path);
             transform(F, f->spectra + (size_t)j * each, path, M);
         }
         for (int32_t j = 0; j < J; j++)
@@ -236,7 +232,7 @@ static void correlate_paths(budget *f)
                 add_product(F, f->SS + times(j * J + a, F->F), f->spectra + (size_t)j * each,
                             f->spectra + (size_t)a * each, 1, -1);
         for (int32_t c = 0; c < I; c++) {
-            primary_of(&f->posterior, row, c, path);
+            path_of(&f->posterior, row, c, path);
             transform(F, P, path, N);
             for (int32_t j = 0; j < J; j++)
                 add_product(F, f->products + times(j * I + c, F->F), f->spectra + (size_t)j * each,
@@ -255,24 +251,19 @@ static void set_equations(budget *f)
     correlate_paths(f);
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++) {
-            clear(sums, each);
-            for (int32_t c = 0; c < I; c++)
-                add_product(F, sums, f->products + times(j * I + c, F->F),
-                            f->R_at + times(i * I + c, F->F), 1, 1);
-            transform_back(F, lags, sums);
-            copy(f->b + times(j * I + i, L), lags, (size_t)L);
+            multiply_row(F, sums, f->R_at + times(i * I, F->F), f->products + times(j * I, F->F),
+                         I);
+            transform_back(F, f->b + times(j * I + i, L), sums, L);
         }
-    for (int32_t j = 0; j < J; j++) {
-        transform_back(F, lags, f->SS + times(j * J + j, F->F));
-        f->gain[j] = lags[0];
-    }
+    for (int32_t j = 0; j < J; j++)
+        transform_back(F, f->gain + j, f->SS + times(j * J + j, F->F), 1);
     for (int32_t ji = 0; ji < J * I; ji++)
         for (int32_t ac = 0; ac <= ji; ac++) {
             const int32_t j = ji / I, i = ji % I, a = ac / I, c = ac % I;
             clear(sums, each);
             add_product(F, sums, f->SS + times(j * J + a, F->F), f->R_at + times(i * I + c, F->F),
                         1, 1);
-            transform_back(F, lags, sums);
+            transform_back(F, lags, sums, F->F);
             for (int32_t l = 1; l < L; l++) behind[l] = -lags[F->F - l]; /* it is skew */
             transform_lags(F, f->smooth_A + times(ji * J * I + ac, F->F), lags, behind, L, 1);
         }
@@ -287,11 +278,8 @@ static void multiply_references(budget *f, const real *R, real *to, const real *
     real *sums = scratch_row(F, 2);
     for (int32_t c = 0; c < I; c++) transform(F, f->spectra + (size_t)c * each, v + times(c, L), L);
     for (int32_t i = 0; i < I; i++) {
-        clear(sums, each);
-        for (int32_t c = 0; c < I; c++)
-            add_product(F, sums, R + times(i * I + c, F->F), f->spectra + (size_t)c * each, 1, 1);
-        transform_back(F, scratch_row(F, 3), sums);
-        copy(to + times(i, L), scratch_row(F, 3), (size_t)L);
+        multiply_row(F, sums, R + times(i * I, F->F), f->spectra, I);
+        transform_back(F, to + times(i, L), sums, L);
     }
 }
 
@@ -313,13 +301,10 @@ static void multiply_filters(void *self, real *to, const real *v)
     real *sums = scratch_row(F, 2);
     for (int32_t ac = 0; ac < J * I; ac++)
         transform(F, f->spectra + (size_t)ac * each, v + times(ac, L), L);
-    clear(f->products, (size_t)(J * I) * each);
     for (int32_t a = 0; a < J; a++)
         for (int32_t i = 0; i < I; i++)
-            for (int32_t c = 0; c < I; c++)
-                add_product(F, f->products + times(a * I + i, F->F),
-                            f->R_at + times(i * I + c, F->F), f->spectra + times(a * I + c, F->F),
-                            1, 1);
+            multiply_row(F, f->products + times(a * I + i, F->F), f->R_at + times(i * I, F->F),
+                         f->spectra + times(a * I, F->F), I);
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++) {
             const real *own = f->products + times(j * I + i, F->F);
@@ -328,8 +313,7 @@ static void multiply_filters(void *self, real *to, const real *v)
             for (int32_t a = 0; a < J; a++)
                 add_product(F, sums, f->SS + times(j * J + a, F->F),
                             f->products + times(a * I + i, F->F), 1, 1);
-            transform_back(F, scratch_row(F, 3), sums);
-            copy(to + times(j * I + i, L), scratch_row(F, 3), (size_t)L);
+            transform_back(F, to + times(j * I + i, L), sums, L);
         }
 }
 
@@ -363,24 +347,6 @@ static void solve_filters(budget *f)
 
 /* The prices. */
 
-/* Solve H x = x, of J equations; H, symmetric and definite, becomes its factor. */
-static void solve_small(real *H, real *x, int32_t J)
-{
-    for (int32_t i = 0; i < J; i++) {
-        for (int32_t c = 0; c <= i; c++) {
-            real sum = H[i * J + c];
-            for (int32_t k = 0; k < c; k++) sum -= H[i * J + k] * H[c * J + k];
-            H[i * J + c] = c < i ? sum * H[c * J + c] : 1 / root(larger(sum, LEAST_POWER));
-        }
-        for (int32_t k = 0; k < i; k++) x[i] -= H[i * J + k] * x[k];
-        x[i] *= H[i * J + i];
-    }
-    for (int32_t i = J - 1; i >= 0; i--) {
-        for (int32_t k = i + 1; k < J; k++) x[i] -= H[k * J + i] * x[k];
-        x[i] *= H[i * J + i];
-    }
-}
-
 /* Set the powers of the filters; u_j = R v_j are left in the vectors. */
 static void set_powers(budget *f, real *power)
 {
@@ -388,61 +354,39 @@ static void set_powers(budget *f, real *power)
         power[j] = power_of(f, f->R_at, f->now, j, f->vectors + times(j, f->s.I * f->s.L));
 }
 
-/* Set H_ja = u_j'A^-1 u_a, with the preconditioner in place of A. */
-static void set_slopes(budget *f, real *H)
+/* Set the sums over a of |u_j'A^-1 u_a|, with the preconditioner in place of A. */
+static void set_slopes(budget *f, real *slope)
 {
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
-    const size_t each = (size_t)F->F;
-    const real *u = f->vectors;
+    clear(slope, (size_t)J);
     for (int32_t ji = 0; ji < J * I; ji++)
-        transform(F, f->products + (size_t)ji * each, u + times(ji, L), L);
+        transform(F, f->products + times(ji, F->F), f->vectors + times(ji, L), L);
     for (int32_t a = 0; a < J; a++) {
         clear(f->spectra, times(J * I, F->F));
         copy(f->spectra + times(a * I, F->F), f->products + times(a * I, F->F), times(I, F->F));
         solve_spectra(F, f->factor, f->spectra, J * I);
         for (int32_t j = 0; j < J; j++) {
-            H[j * J + a] = 0;
-            for (int32_t i = 0; i < I; i++) {
-                const real *x = f->products + times(j * I + i, F->F);
-                const real *y = f->spectra + times(j * I + i, F->F);
-                H[j * J + a] += 2 * dot(x, y, F->F) / (real)F->F;
-            }
+            const size_t at = times(j * I, F->F);
+            const real h = dot(f->products + at, f->spectra + at, I * F->F) * 2 / (real)F->F;
+            slope[j] += h < 0 ? -h : h;
         }
     }
 }
 
 /* Make a step of Newton's method with the prices, of which power^-1/2 is nearly a line, with the
- * slope power^-3/2 u'A^-1 u. Return whether a price has changed. */
+ * slopes power^-3/2 u'A^-1 u. Each price moves as if all others moved with it, so together they do
+ * not go too far. Return whether a price has changed. */
 static int next_prices(budget *f, const real *power, const real *target)
 {
-    const int32_t J = f->s.J;
-    real *H = f->small, *size = H + times(J, J), *step = size + J;
-    real *factor = f->factor, *price = f->price, gain = 0;
-    set_slopes(f, H);
-    for (int32_t j = 0; j < J; j++) {
-        const int free = price[j] > 0 || power[j] > target[j];
-        size[j] = free ? 1 / root(larger(H[j * J + j], LEAST_POWER)) : 0;
-    }
-    for (int32_t j = 0; j < J; j++)
-        for (int32_t a = 0; a < J; a++) H[j * J + a] *= size[j] * size[a];
-    for (int32_t j = 0; j < J; j++) H[j * J + j] += size[j] > 0 ? REGULAR : 1;
-    for (int straight = 0; straight < 2 && !(gain > 0); straight++) {
-        copy(factor, H, times(J, J));
-        for (int32_t j = 0; j < J; j++)
-            step[j] = size[j] * (straight ? (power[j] - target[j]) / 2
-                                          : power[j] * (root(power[j] / target[j]) - 1));
-        solve_small(factor, step, J);
-        for (int32_t j = 0; j < J; j++) {
-            step[j] *= size[j];
-            gain += step[j] * (power[j] - target[j]);
-        }
-    }
+    real *slope = f->small;
     int changed = 0;
-    for (int32_t j = 0; j < J; j++) {
-        const real last = price[j], next = larger(last + step[j], 0);
-        price[j] = next < (real)1e-9 * f->gain[j] ? 0 : next;
-        changed |= price[j] != last;
+    set_slopes(f, slope);
+    for (int32_t j = 0; j < f->s.J; j++) {
+        const real last = f->price[j], over = power[j] * (root(power[j] / target[j]) - 1);
+        const real next = larger(last + over / larger(slope[j], LEAST_POWER), 0);
+        f->price[j] = next < (real)1e-9 * f->gain[j] ? 0 : next;
+        changed |= f->price[j] != last;
     }
     return changed;
 }
@@ -453,12 +397,10 @@ static int next_prices(budget *f, const real *power, const real *target)
 static real power_of_block(const budget *f, const real *v)
 {
     const int32_t L = f->s.L, B = f->posterior.B;
-    real *y = work_row(f, 0), *part = work_row(f, 1);
+    real *y = f->work;
     clear(y, (size_t)B);
-    for (int32_t i = 0; i < f->s.I; i++) {
-        correlate(part, v + times(i, L), L, history_of(&f->posterior, i), B);
-        add_to(y, part, B);
-    }
+    for (int32_t i = 0; i < f->s.I; i++)
+        add_lags(&f->posterior.fourier, y, v + times(i, L), L, history_of(&f->posterior, i), B);
     return dot(y, y, B) / (real)B;
 }
 
@@ -505,7 +447,7 @@ static void solve_at_prices(budget *f, const real *level, real *power, real *aff
 static void solve_all(budget *f)
 {
     const int32_t J = f->s.J, n = f->s.I * f->s.L;
-    real *level = f->small + times(J + 2, J), *power = level + J, *afforded = power + J;
+    real *level = f->small + J, *power = level + J, *afforded = power + J;
     set_equations(f);
     set_levels(f, level);
     solve_at_prices(f, level, power, afforded);

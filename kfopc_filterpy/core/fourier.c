@@ -149,7 +149,7 @@ void transform(const fourier *f, real *spectrum, const real *from, int32_t n)
     copy(spectrum, transform_complex(f, re, scratch_row(f, 1)), (size_t)f->F);
 }
 
-void transform_back(const fourier *f, real *to, const real *spectrum)
+void transform_back(const fourier *f, real *to, const real *spectrum, int32_t n)
 {
     const int32_t H = f->half;
     const real scale = 2 / (real)f->F;
@@ -160,25 +160,25 @@ void transform_back(const fourier *f, real *to, const real *spectrum)
         a[H + k] = spectrum[k] * scale;
     }
     const real *Z = transform_complex(f, a, scratch_row(f, 1));
-    for (int32_t k = 0; k < H; k++) {
-        to[k] = Z[H + k] * c[k] - Z[k] * d[k];
-        to[H + k] = -Z[H + k] * d[k] - Z[k] * c[k];
-    }
+    for (int32_t k = 0; k < n && k < H; k++) to[k] = Z[H + k] * c[k] - Z[k] * d[k];
+    for (int32_t k = 0; k < n - H; k++) to[H + k] = -Z[H + k] * d[k] - Z[k] * c[k];
 }
 
 void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *v, int32_t lags)
 {
     real *U = scratch_row(f, 2), *V = scratch_row(f, 3), *sums = scratch_row(f, 4);
-    const int32_t part = f->F - lags + 1;
-    clear(sums, (size_t)f->F);
-    for (int32_t begin = 0; begin < n; begin += part) {
-        const int32_t count = n - begin < part ? n - begin : part;
-        transform(f, U, u + begin, count);
-        transform(f, V, v + begin, count + lags - 1);
-        add_product(f, sums, U, V, 1, -1);
+    for (int32_t first = 0; first < lags; first += f->half) {
+        const int32_t now = lags - first < f->half ? lags - first : f->half, part = f->F - now + 1;
+        clear(sums, (size_t)f->F);
+        for (int32_t begin = 0; begin < n; begin += part) {
+            const int32_t count = n - begin < part ? n - begin : part;
+            transform(f, U, u + begin, count);
+            transform(f, V, v + first + begin, count + now - 1);
+            add_product(f, sums, U, V, 1, -1);
+        }
+        transform_back(f, U, sums, now);
+        add_scaled(to + first, 1, U, now);
     }
-    transform_back(f, U, sums);
-    for (int32_t l = 0; l < lags; l++) to[l] += U[l];
 }
 
 void transform_lags(const fourier *f, real *spectrum, const real *ahead, const real *behind,
@@ -199,6 +199,14 @@ static void scale_spectrum(const fourier *f, real *restrict x, const real *restr
 {
     for (int32_t k = 0; k < f->half; k++) x[k] *= by[k];
     for (int32_t k = 0; k < f->half; k++) x[f->half + k] *= by[k];
+}
+
+void multiply_row(const fourier *f, real *to, const real *row, const real *x, int32_t n)
+{
+    const size_t each = (size_t)f->F;
+    clear(to, each);
+    for (int32_t c = 0; c < n; c++)
+        add_product(f, to, row + (size_t)c * each, x + (size_t)c * each, 1, 1);
 }
 
 void factorise_spectra(const fourier *f, real *A, int32_t n)
@@ -240,14 +248,11 @@ void solve_spectra(const fourier *f, const real *factor, real *x, int32_t n)
 void solve_circulants(const fourier *f, const real *factor, real *spectra, real *to, const real *r,
                       int32_t n, int32_t taps)
 {
-    real *part = scratch_row(f, 2);
     for (int32_t i = 0; i < n; i++)
         transform(f, spectra + times(i, f->F), r + times(i, taps), taps);
     solve_spectra(f, factor, spectra, n);
-    for (int32_t i = 0; i < n; i++) {
-        transform_back(f, part, spectra + times(i, f->F));
-        copy(to + times(i, taps), part, (size_t)taps);
-    }
+    for (int32_t i = 0; i < n; i++)
+        transform_back(f, to + times(i, taps), spectra + times(i, f->F), taps);
 }
 
 void approach(const equations *of, const real *b, real *v, int steps)

@@ -23,9 +23,9 @@ void layout_fourier(fourier *f, int32_t N, anc_layout *at);
 void start_fourier(const fourier *f);
 /* Transform n <= F numbers, with zeros after them. */
 void transform(const fourier *f, real *spectrum, const real *from, int32_t n);
-/* Set F numbers to those of a spectrum. */
-void transform_back(const fourier *f, real *to, const real *spectrum);
-/* Add sum_k u(k) v(k + l), k < n, to to_l, l < lags; lags <= F / 2. */
+/* Set `to` to the first n of the F numbers of a spectrum. */
+void transform_back(const fourier *f, real *to, const real *spectrum, int32_t n);
+/* Add sum_k u(k) v(k + l), k < n, to to_l, l < lags. */
 void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *v, int32_t lags);
 /* Set a spectrum to that of ahead_l at lags l and behind_l at lags -l, l < n, under a triangle that
  * ends at lag n if `smooth`: then a definite Toeplitz matrix gives a definite circulant near to it,
@@ -46,6 +46,8 @@ static inline void add_product(const fourier *f, real *restrict to, const real *
     }
 }
 
+/* Set `to` to a row of the matrix times n spectra x. */
+void multiply_row(const fourier *f, real *to, const real *row, const real *x, int32_t n);
 /* Factorise the lower triangle of a Hermitian matrix in place, at each frequency; the diagonal
  * becomes 1 / the factor's. Where it is singular, but for rounding, that is 0. */
 void factorise_spectra(const fourier *f, real *A, int32_t n);
@@ -62,7 +64,7 @@ typedef struct {
     void (*multiply)(void *self, real *to, const real *v);     /* to = A v */
     void (*precondition)(void *self, real *to, const real *r); /* to = about A^-1 r */
     int32_t n;
-    real *work; /* (4, n); then the first n are b - A v */
+    real *work; /* (4, n) */
 } equations;
 
 /* Take steps of conjugate gradients from v on. */

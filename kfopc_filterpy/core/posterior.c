@@ -12,39 +12,6 @@ enum { PARTS_OF_BLOCK = 8 };
 /* Steps of conjugate gradients in a block. */
 enum { PLANT_STEPS = 8 };
 
-/* Correlations. Every sum is in the order of k, whatever the number of sums that are formed at
- * once. */
-
-/* Set the next `vectors_at_once` WIDE sums. */
-static inline void sums_of(real *restrict to, const real *restrict a, int32_t n,
-                           const real *restrict b, const int vectors_at_once)
-{
-    vector sum[8];
-    for (int v = 0; v < vectors_at_once; v++) sum[v] = zero;
-    for (int32_t k = 0; k < n; k++)
-        for (int v = 0; v < vectors_at_once; v++) sum[v] += a[k] * vectors(b + k)[v];
-    for (int v = 0; v < vectors_at_once; v++) vectors_of(to)[v] = sum[v];
-}
-
-void correlate(real *restrict to, const real *restrict a, int32_t n, const real *restrict b,
-               int32_t count)
-{
-    int32_t l = 0;
-    for (; l + 8 * WIDE <= count; l += 8 * WIDE) sums_of(to + l, a, n, b + l, 8);
-    for (; l + 4 * WIDE <= count; l += 4 * WIDE) sums_of(to + l, a, n, b + l, 4);
-    if (l < count && count >= 4 * WIDE) { /* the last ones, some of them again */
-        l = count - 4 * WIDE;
-        sums_of(to + l, a, n, b + l, 4);
-        return;
-    }
-    for (; l + WIDE <= count; l += WIDE) sums_of(to + l, a, n, b + l, 1);
-    for (; l < count; l++) {
-        real sum = 0;
-        for (int32_t k = 0; k < n; k++) sum += a[k] * b[l + k];
-        to[l] = sum;
-    }
-}
-
 /* Layout. */
 
 void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, anc_layout *at)
@@ -66,22 +33,21 @@ void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, 
     f->z = reals(at, "history", ANC_STATE, 1, 1, I + J, f->history);
     f->errors = reals(at, "block_errors", ANC_STATE, 1, 1, K, block);
     f->heard = int32s(at, "block_counts", ANC_STATE, BLOCK_COUNTS);
-    f->theta = reals(at, "theta", ANC_STATE, 1, 1, K, f->n);
+    f->theta = reals(at, "theta", ANC_STATE, 1, K, C, N);
     f->q = reals(at, "noise", ANC_STATE, 1, 1, 1, K);
     f->T = reals(at, "data", ANC_STATE, 1, C, C, N);
     f->r = reals(at, "data_of_errors", ANC_STATE, 1, rows, C, N);
     f->ee = reals(at, "error_energy", ANC_STATE, 1, 1, 1, K);
     f->before = reals(at, "before_data", ANC_STATE, 1, 1, C, N);
     f->solution = reals(at, "solution", ANC_STATE, 1, rows, C, N);
-    f->unit = reals(at, "prior_draws", ANC_STATE, 1, draws, C, N);
+    f->prior = reals(at, "prior", ANC_STATE, 1, rows, C, N);
     f->T_at = reals(at, "data_spectra", ANC_SCRATCH, 1, C, C, spectrum);
     f->factor = reals(at, "data_factor", ANC_SCRATCH, 1, C, C, spectrum);
     f->ahead_at = reals(at, "newest_spectra", ANC_SCRATCH, 1, 1, C, spectrum);
     f->before_at = reals(at, "before_spectra", ANC_SCRATCH, 1, 1, C, spectrum);
     f->spectra = reals(at, "posterior_spectra", ANC_SCRATCH, 1, 1, C + 1, spectrum);
     f->products = reals(at, "posterior_products", ANC_SCRATCH, 1, 1, C, spectrum);
-    f->next_q = reals(at, "next_noise", ANC_SCRATCH, 1, 1, 1, K);
-    f->taper = reals(at, "taper", ANC_SCRATCH, 1, 1, 1, N);
+    f->taper = reals(at, "taper", ANC_SCRATCH, 1, 1, 1, block + N - 1);
     f->faded = reals(at, "faded", ANC_SCRATCH, 1, 1, C, block + N - 1);
     f->right = reals(at, "right_side", ANC_SCRATCH, 1, 1, C, N);
     f->vectors = reals(at, "posterior_vectors", ANC_SCRATCH, 1, 4, C, N);
@@ -98,12 +64,6 @@ static real *taps_of(const posterior *f, real *vectors, int32_t row, int32_t c)
 
 /* Return how many taps signal c has. */
 static int32_t taps_in(const posterior *f, int32_t c) { return c < f->I ? f->N : f->M; }
-
-/* Return where signal c is in a theta. */
-static int32_t place_in_theta(const posterior *f, int32_t c)
-{
-    return c < f->I ? c * f->N : f->I * f->N + (c - f->I) * f->M;
-}
 
 /* Return s^ of microphone k in place of signal c. */
 static const real *given_path(const posterior *f, int32_t k, int32_t c)
@@ -126,14 +86,15 @@ void start_posterior(posterior *f, real spread)
     f->counts[RANDOM] = 1;
     start_fourier(&f->fourier);
     for (int32_t k = 0; k < f->K; k++)
-        for (int32_t c = f->I; c < f->C; c++)
-            copy(f->theta + times(k, f->n) + place_in_theta(f, c), given_path(f, k, c),
-                 (size_t)f->M);
-    for (int32_t row = 0; row < f->rows - f->K; row++)
+        for (int32_t c = f->I; c < f->C; c++) {
+            copy(taps_of(f, f->prior, k, c), given_path(f, k, c), (size_t)f->M);
+            copy(taps_of(f, f->theta, k, c), given_path(f, k, c), (size_t)f->M);
+        }
+    for (int32_t row = f->K; row < f->rows; row++)
         for (int32_t c = 0; c < f->C; c++)
             for (int32_t i = 0; i < f->N; i++) {
                 const real sign = sign_of(f->counts + RANDOM);
-                if (i < taps_in(f, c)) taps_of(f, f->unit, row, c)[i] = sign;
+                if (i < taps_in(f, c)) taps_of(f, f->prior, row, c)[i] = sign;
             }
 }
 
@@ -196,7 +157,7 @@ static void leave_out(posterior *f, const real *edge, const real *T, real *out, 
     clear(sums, each);
     for (int32_t c = 0; c < f->C; c++)
         add_product(F, sums, edge + (size_t)c * each, T + (size_t)c * each, 1, -turn);
-    transform_back(F, rows, sums);
+    transform_back(F, rows, sums, until);
     clear(rows, (size_t)from);
     transform(F, sums, rows, until);
     for (int32_t c = 0; c < f->C; c++)
@@ -211,11 +172,8 @@ static void multiply_data(posterior *f, real *to, const real *t, real q)
     const size_t each = (size_t)F->F;
     real *T = f->spectra, *out = f->products;
     for (int32_t c = 0; c < C; c++) transform(F, T + (size_t)c * each, t + times(c, N), N);
-    clear(out, (size_t)C * each);
     for (int32_t a = 0; a < C; a++)
-        for (int32_t c = 0; c < C; c++)
-            add_product(F, out + (size_t)a * each, f->T_at + times(a * C + c, F->F),
-                        T + (size_t)c * each, 1, 1);
+        multiply_row(F, out + (size_t)a * each, f->T_at + times(a * C, F->F), T, C);
     leave_out(f, f->ahead_at, T, out, 1, N, 1);
     leave_out(f, f->before_at, T, out, 0, N - 1, -1);
     real *part = scratch_row(F, 2);
@@ -223,7 +181,7 @@ static void multiply_data(posterior *f, real *to, const real *t, real q)
         const int32_t n = taps_in(f, c);
         const real ridge = q * precision_of(f, c);
         real *restrict sums = to + times(c, N);
-        transform_back(F, part, out + (size_t)c * each);
+        transform_back(F, part, out + (size_t)c * each, n);
         for (int32_t i = 0; i < n; i++)
             sums[i] = part[i] + ridge * f->taper[i] * f->taper[i] * t[times(c, N) + (size_t)i];
         for (int32_t i = n; i < N; i++) sums[i] = 0;
@@ -268,39 +226,29 @@ static void prepare(posterior *f, real q)
 static void set_right(posterior *f, int32_t row, real q)
 {
     for (int32_t c = 0; c < f->C; c++) {
-        const real *r = taps_of(f, f->r, row, c), ridge = q * precision_of(f, c);
+        const real *r = taps_of(f, f->r, row, c), *prior = taps_of(f, f->prior, row, c);
+        const real ridge = q * precision_of(f, c),
+                   share = row < f->K ? 1 : 1 / root(larger(ridge, NEARLY_ZERO));
         real *restrict right = f->right + times(c, f->N), *t = taps_of(f, f->solution, row, c);
-        const real *unit = row < f->K ? NULL : taps_of(f, f->unit, row - f->K, c);
-        const real *given = row < f->K && c >= f->I ? given_path(f, row, c) : NULL;
-        for (int32_t i = 0; i < taps_in(f, c); i++) {
-            const real pull = unit    ? root(ridge) * f->taper[i] * unit[i]
-                              : given ? ridge * f->taper[i] * given[i]
-                                      : 0;
-            right[i] = r[i] + pull;
-            if (f->counts[FRESH]) t[i] = ridge > 0 ? pull / (ridge * f->taper[i] * f->taper[i]) : 0;
+        for (int32_t i = 0; i < f->N; i++) {
+            right[i] = r[i] + ridge * share * f->taper[i] * prior[i];
+            if (f->counts[FRESH]) t[i] = share * prior[i] / f->taper[i];
         }
-        for (int32_t i = taps_in(f, c); i < f->N; i++) right[i] = 0;
     }
 }
 
-/* Return the noise of a microphone from the residual sum e^2 - 2 theta'r + theta'G theta; `rest` is
- * what the equations of its row leave. */
-static real noise_of(posterior *f, int32_t k, real q, const real *rest)
+/* Return the noise of a microphone from the residual, sum e^2 + theta'(G theta - 2 r). */
+static real noise_of(posterior *f, int32_t k)
 {
     const real samples = f->numbers->samples, n = (real)f->n;
-    real residual = f->ee[k];
-    for (int32_t c = 0; c < f->C; c++) {
-        const real *t = taps_of(f, f->solution, k, c), *r = taps_of(f, f->r, k, c);
-        const real *right = f->right + times(c, f->N), ridge = q * precision_of(f, c);
-        for (int32_t i = 0; i < taps_in(f, c); i++) {
-            const real pull = ridge * f->taper[i] * f->taper[i] * t[i];
-            residual += t[i] * (right[i] - rest[times(c, f->N) + (size_t)i] - pull - 2 * r[i]);
-        }
-    }
+    const real *t = taps_of(f, f->solution, k, 0), *r = taps_of(f, f->r, k, 0);
+    real *product = f->vectors, residual = f->ee[k];
+    multiply_data(f, product, t, 0);
+    for (int32_t i = 0; i < f->C * f->N; i++) residual += t[i] * (product[i] - 2 * r[i]);
     /* The earlier estimate counts as n samples: a short record leaves little noise by chance. Below
      * -60 dB, it could be rounding. */
-    const real weight = larger(samples - (real)(f->I * f->N) / 2, 0) + n;
-    return larger((larger(residual, 0) + n * f->q[k]) / weight, (real)1e-6 * f->ee[k] / samples);
+    const real noise = (larger(residual, 0) + n * f->q[k]) / (samples + n);
+    return larger(noise, (real)1e-6 * f->ee[k] / samples);
 }
 
 /* By chance alone, n taps explain n q. James and Stein: what is not significant is not played. */
@@ -320,16 +268,16 @@ static void keep_significant(posterior *f)
     f->numbers->explained = share * share * explained;
 }
 
-/* Set what is believed of the means. */
-static void set_theta(posterior *f)
+void path_of(const posterior *f, int32_t row, int32_t signal, real *to)
 {
-    for (int32_t k = 0; k < f->K; k++)
-        for (int32_t c = 0; c < f->C; c++) {
-            const real *t = taps_of(f, f->solution, k, c);
-            const real share = c < f->I ? f->numbers->significant : 1;
-            real *theta = f->theta + times(k, f->n) + place_in_theta(f, c);
-            for (int32_t i = 0; i < taps_in(f, c); i++) theta[i] = share * t[i] * f->taper[i];
-        }
+    if (signal >= f->C) { /* it is exact */
+        copy(to, given_path(f, row, signal), (size_t)f->M);
+        return;
+    }
+    const real drawn = row < f->K ? 1 : root((real)f->K / (real)DRAWS * mean_noise(f));
+    const real share = signal < f->I ? f->numbers->significant * drawn : drawn;
+    const real *t = taps_of(f, f->solution, row, signal);
+    for (int32_t i = 0; i < taps_in(f, signal); i++) to[i] = share * f->taper[i] * t[i];
 }
 
 /* Return the energy in the data of the signals from `begin` to `end`. */
@@ -355,26 +303,23 @@ static int approach_posterior(posterior *f)
     const int32_t draws = f->rows - f->K;
     const real q = mean_noise(f), renewed = (real)(f->B * draws) / f->numbers->samples;
     prepare(f, q);
-    for (int32_t k = 0; k < f->K; k++) {
-        solve_row(f, k, q);
-        f->next_q[k] = noise_of(f, k, q, f->vectors);
-    }
+    for (int32_t k = 0; k < f->K; k++) solve_row(f, k, q);
     /* Draws take turns: all are solved again by the time that as many samples are new as the data
      * stand for. */
     for (int32_t i = 0; i < draws && (f->counts[FRESH] || (real)i < renewed); i++) {
         solve_row(f, f->K + f->counts[TURN], q);
         f->counts[TURN] = (f->counts[TURN] + 1) % draws;
     }
-    copy(f->q, f->next_q, (size_t)f->K);
+    for (int32_t k = 0; k < f->K; k++) f->q[k] = noise_of(f, k);
     /* Draws are over sqrt(q). If q rises, they keep their size, until they are solved with it. */
     const real scale = smaller(root(q / mean_noise(f)), 1);
     real *drawn = taps_of(f, f->solution, f->K, 0);
     for (int32_t i = 0; scale < 1 && i < draws * f->C * f->N; i++) drawn[i] *= scale;
     keep_significant(f);
-    set_theta(f);
+    for (int32_t k = 0; k < f->K; k++)
+        for (int32_t c = 0; c < f->C; c++) path_of(f, k, c, taps_of(f, f->theta, k, c));
     count_up(f->fits);
     f->counts[FRESH] = 0;
-    f->numbers->taught = energy_of_data(f, f->I, f->C);
     return 1;
 }
 
@@ -398,18 +343,33 @@ void begin_block(posterior *f)
     }
 }
 
-/* Set d to p * x and z to s * y of the block. */
-static void explain(const posterior *f, const real *theta, real *d, real *z)
+/* Set the taper, and the faded signals. */
+static void fade_signals(posterior *f, real forget)
 {
-    real *part = work_of(f, 0);
-    clear(d, (size_t)f->B);
-    clear(z, (size_t)f->B);
-    for (int32_t i = 0; i < f->I + (f->exact ? 0 : f->J); i++) {
-        const int32_t taps = i < f->I ? f->N : f->M;
-        correlate(part, theta, taps, history_of(f, i), f->B);
-        add_to(i < f->I ? d : z, part, f->B);
-        theta += taps;
+    const int32_t length = f->B + f->N - 1;
+    const real g = root(forget);
+    real share = 1;
+    for (int32_t i = 0; i < length; i++, share *= g) {
+        f->taper[i] = share;
+        for (int32_t c = 0; c < f->C; c++)
+            f->faded[times(c, length) + (size_t)i] =
+                (c < f->I ? share : -share) * history_of(f, c)[i];
     }
+}
+
+static const real *faded_of(const posterior *f, int32_t c)
+{
+    return f->faded + times(c, f->B + f->N - 1);
+}
+
+/* Set `to` to what a row hears of the signals from `begin` to `end` in the n newest samples. */
+static void respond(const posterior *f, int32_t row, int32_t begin, int32_t end, int32_t n,
+                    real *to)
+{
+    clear(to, (size_t)n);
+    for (int32_t c = begin; c < end; c++)
+        add_lags(&f->fourier, to, taps_of(f, f->solution, row, c), taps_in(f, c), faded_of(f, c),
+                 n);
 }
 
 /* Return the mean power of the doubt in a block: that of the draws; without draws, what n unknown
@@ -417,39 +377,13 @@ static void explain(const posterior *f, const real *theta, real *d, real *z)
 static real power_of_doubt(const posterior *f)
 {
     const real q = mean_noise(f);
-    real *sum = work_of(f, 1), *part = work_of(f, 0), *taps = work_of(f, 2), doubt = 0;
-    if (f->exact) return q * (real)f->n / f->numbers->samples;
+    real *heard = work_of(f, 0), doubt = 0;
+    if (f->exact) return q * (real)f->n / larger(f->numbers->samples, 1);
     for (int32_t row = f->K; row < f->rows; row++) {
-        clear(sum, (size_t)f->B);
-        for (int32_t c = 0; c < f->C; c++) {
-            const int32_t n = taps_in(f, c);
-            const real *t = taps_of(f, f->solution, row, c);
-            for (int32_t i = 0; i < n; i++) taps[i] = t[i] * f->taper[i];
-            correlate(part, taps, n, history_of(f, c), f->B);
-            add_scaled(sum, c < f->I ? 1 : -1, part, f->B);
-        }
-        doubt += dot(sum, sum, f->B) / (real)f->B;
+        respond(f, row, 0, f->C, f->B, heard);
+        doubt += dot(heard, heard, f->B) / (real)f->B;
     }
     return q * doubt / (real)DRAWS;
-}
-
-/* Set the taper, and the faded signals. */
-static void fade_signals(posterior *f, real forget)
-{
-    const real g = root(forget);
-    real share = 1;
-    for (int32_t i = 0; i < f->B + f->N - 1; i++) {
-        if (i < f->N) f->taper[i] = share;
-        for (int32_t c = 0; c < f->C; c++)
-            f->faded[times(c, f->B + f->N - 1) + (size_t)i] =
-                (c < f->I ? share : -share) * history_of(f, c)[i];
-        share *= g;
-    }
-}
-
-static const real *faded_of(const posterior *f, int32_t c)
-{
-    return f->faded + times(c, f->B + f->N - 1);
 }
 
 /* Let the data go, and begin with the newest samples of the block. */
@@ -460,7 +394,7 @@ static void begin_data(posterior *f, int32_t newest)
     clear(f->T, times(C * C, N));
     clear(f->r, times(f->rows * C, N));
     clear(f->ee, (size_t)f->K);
-    known->samples = known->explained = known->taught = 0;
+    known->samples = known->explained = 0;
     f->counts[BEGUN] = f->counts[FRESH] = 1;
     /* The N - 1 samples before the first row are in the lags. */
     real *reversed = f->vectors;
@@ -488,17 +422,11 @@ static void let_fade(real *sums, size_t n, real share)
  * nothing. */
 static void hear_row(posterior *f, int32_t row, int32_t newest, int believed, real *heard)
 {
-    real *part = work_of(f, 1);
-    if (!believed) {
-        clear(heard, (size_t)newest);
-        for (int32_t c = 0; c < f->C; c++) {
-            correlate(part, taps_of(f, f->solution, row, c), taps_in(f, c), faded_of(f, c), newest);
-            add_to(heard, part, newest);
-        }
-    } else if (row < f->K) {
-        const real *e = f->errors + times(row, f->B);
-        for (int32_t t = 0; t < newest; t++) heard[t] = work_of(f, 3)[t] * e[t];
-    } else
+    if (!believed)
+        respond(f, row, 0, f->C, newest, heard);
+    else if (row < f->K)
+        copy(heard, f->errors + times(row, f->B), (size_t)newest);
+    else
         for (int32_t t = 0; t < newest; t++) heard[t] = sign_of(f->counts + RANDOM);
 }
 
@@ -509,12 +437,8 @@ static void add_samples(posterior *f, int32_t newest, int believed, real expecte
     const int32_t C = f->C, N = f->N;
     const real share = raised(forget, newest);
     posterior_numbers *known = f->numbers;
-    real *heard = work_of(f, 2), *weight = work_of(f, 3), of_weights = 0, w = 1;
-    for (int32_t t = 0; t < newest; t++) {
-        weight[t] = w;
-        w *= root(forget);
-        of_weights += weight[t] * weight[t];
-    }
+    real *heard = work_of(f, 0);
+    const real of_weights = dot(f->taper, f->taper, newest);
     let_fade(f->before, times(C, N), root(share));
     let_fade(f->T, times(C * C, N), share);
     let_fade(f->r, times(f->K * C, N), share);
@@ -546,38 +470,32 @@ static int32_t last_part(const posterior *f)
  * last, of d^ and of the errors. */
 typedef struct { real missed, missed_at_last, expected, heard; } judgement;
 
-/* Judge a block. If s^ is exact, add what is played to the errors, because it teaches nothing. */
+/* Judge a block, whose errors fade. If s^ is exact, add what is played to them, because it teaches
+ * nothing. */
 static judgement judge(posterior *f)
 {
     const int32_t B = f->B;
-    real *part = work_of(f, 0), *d = work_of(f, 1), *z = work_of(f, 2);
+    real *d = work_of(f, 0), *z = work_of(f, 1);
     judgement found = {0};
     for (int32_t k = 0; k < f->K; k++) {
         real *error = f->errors + times(k, B);
         found.heard += dot(error, error, B);
         for (int32_t j = 0; f->exact && j < f->J; j++) {
             const real *path = f->path + times(k * f->J + j, f->M);
-            correlate(part, path, f->M, history_of(f, f->I + j), B);
-            add_to(error, part, B);
+            add_lags(&f->fourier, error, path, f->M, history_of(f, f->I + j), B);
         }
-        explain(f, f->theta + times(k, f->n), d, z);
-        for (int32_t t = 0; t < B; t++) z[t] += error[t] - d[t];
+        respond(f, k, 0, f->I, B, d);
+        respond(f, k, f->I, f->C, B, z);
+        for (int32_t t = 0; t < B; t++) {
+            error[t] *= f->taper[t];
+            d[t] *= f->numbers->significant;
+            z[t] = error[t] - d[t] - z[t];
+        }
         found.missed += dot(z, z, B);
         found.missed_at_last += dot(z, z, last_part(f));
         found.expected += dot(d, d, B);
     }
     return found;
-}
-
-/* Return whether the loudspeakers sound in a block, or in what the secondary paths still hold. */
-static int is_loud(const posterior *f)
-{
-    for (int32_t j = 0; j < f->J; j++) {
-        const real *y = history_of(f, f->I + j);
-        for (int32_t t = 0; t < f->B + f->M - 1; t++)
-            if (y[t] != 0) return 1;
-    }
-    return 0;
 }
 
 /* Return whether a block is to be believed. Forget all if it tells of another plant. */
@@ -596,7 +514,7 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
         if (surprised && is->missed_at_last <= limit * (real)(last_part(f) * f->K)) return 0;
     }
     forget = raised(forget, f->B);
-    known->missed = forget * known->missed + smaller(is->missed, is->expected);
+    known->missed = forget * known->missed + is->missed;
     known->expected = forget * known->expected + is->expected;
     if (!surprised) return 1;
     count_up(f->alarms);
@@ -611,7 +529,7 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
 static real energy_of_block(const posterior *f, int32_t begin, int32_t end)
 {
     real energy = 0;
-    for (int32_t c = begin; c < end; c++) energy += dot(history_of(f, c), history_of(f, c), f->B);
+    for (int32_t c = begin; c < end; c++) energy += dot(faded_of(f, c), faded_of(f, c), f->B);
     return energy;
 }
 
@@ -624,9 +542,7 @@ static void learn_samples(posterior *f, int32_t newest, real forget)
     if (!newest && !known) return;
     const judgement is = judge(f);
     int32_t believed = newest;
-    /* Judged is what was fitted to data that include the loudspeakers, unless they are silent. */
-    const int judged = f->exact ? f->numbers->samples > 0 : f->numbers->taught > 0 || !is_loud(f);
-    if (newest && known && judged && !notice_surprise(f, &is, forget)) believed = 0;
+    if (newest && known && !notice_surprise(f, &is, forget)) believed = 0;
     const real x2 = energy_of_block(f, 0, f->I), y2 = energy_of_block(f, f->I, f->C);
     const real x2_of_data = energy_of_data(f, 0, f->I), y2_of_data = energy_of_data(f, f->I, f->C);
     if (believed) {
@@ -652,28 +568,4 @@ void learn(posterior *f, real forget)
     if (!f->counts[BEGUN] && rows < least) return;
     if (!f->heard[MISSING] && rows >= least) newest = rows < f->B ? rows : f->B;
     learn_samples(f, newest, forget);
-}
-
-/* Return the factor on a row such that sums over rows are expectations. */
-static real scale_of(const posterior *f, int32_t row)
-{
-    return row < f->K ? 1 : root((real)f->K / (real)DRAWS * mean_noise(f));
-}
-
-void secondary_of(const posterior *f, int32_t row, int32_t j, real *to)
-{
-    const real scale = scale_of(f, row);
-    if (f->exact) {
-        copy(to, given_path(f, row, f->I + j), (size_t)f->M);
-        return;
-    }
-    const real *t = taps_of(f, f->solution, row, f->I + j);
-    for (int32_t i = 0; i < f->M; i++) to[i] = scale * t[i] * f->taper[i];
-}
-
-void primary_of(const posterior *f, int32_t row, int32_t i, real *to)
-{
-    const real scale = scale_of(f, row);
-    const real *t = taps_of(f, f->solution, row, i);
-    for (int32_t m = 0; m < f->N; m++) to[m] = f->numbers->significant * scale * t[m] * f->taper[m];
 }

@@ -112,7 +112,7 @@ class Plant:
         self.q, self.significant, self.precision = np.zeros(self.K), 1.0, np.zeros(self.mask.size)
         self.begun = self.waiting = self.silent = False  # waiting: no fit of a whole block since a surprise
         self.fits = self.surprises = self.turn = 0
-        self.missed = self.expected = self.taught = 0.0
+        self.missed = self.expected = 0.0
 
     def signs(self, rows, n):
         """Return random signs."""
@@ -138,14 +138,14 @@ class Plant:
         before = z[:, : z.shape[1] - newest][:, 1 - N :] * self.g ** (np.arange(N - 2, -1, -1) / 2)
         self.before = lags(np.pad(before, [(0, 0), (N - 1, 0)]), N)
         self.G, self.r, self.ee = np.zeros((self.C * N, self.C * N)), np.zeros_like(self.theta), np.zeros(self.K)
-        self.count = self.explained = self.taught = 0.0
+        self.count = self.explained = 0.0
         self.begun = self.fresh = True
 
     def learn(self, x, y, e, new):
         """Take the `new` last samples of the errors e (K, B) of a block, with which x and y end; 0: they are not known."""
         K, N, I, known = self.K, self.N, len(x), self.fits and not self.waiting  # noqa: E741
-        z, heard = np.concatenate([x, -y]), np.mean(e**2)
-        played = np.any(y[:, -self.B - self.M + 1 :])
+        z, w = np.concatenate([x, -y]), self.g ** (np.arange(self.B - 1, -1, -1) / 2)
+        heard = np.mean(e**2)
         if self.exact:  # s^ is right: what it plays is no news
             e = e - self.mean @ regressors(z, N).T
             z[I:] = 0.0
@@ -153,12 +153,12 @@ class Plant:
             self.begin(z, new)
         if not (new or known):
             return
-        Z = regressors(z, N)
+        Z, e = regressors(z, N) * w[:, None], e * w
         d = self.significant * self.theta[:K, : self.split] @ Z[:, : self.split].T
-        if new and known and (self.count > 0 if self.exact else not played or self.taught > 0):
-            missed = np.mean((e - self.theta[:K] @ Z.T) ** 2, axis=0)
+        if new and known:
+            missed = np.mean((e - d - self.theta[:K, self.split :] @ Z[:, self.split :].T) ** 2, axis=0)
             new = new if self.believes(missed, np.mean(d**2), heard, z, Z) else 0
-        x2, y2 = (np.sum(z[part, -self.B :] ** 2) for part in (slice(I), slice(I, None)))
+        x2, y2 = (np.sum((z[part, -self.B :] * w) ** 2) for part in (slice(I), slice(I, None)))
         x2_of_data, y2_of_data = self.energy_of(slice(I)), self.energy_of(slice(I, None))
         if new:
             if x2 > core.LOUDER * x2_of_data:
@@ -175,7 +175,7 @@ class Plant:
         """Return whether a block is to be believed; forget all if it tells of another plant."""
         noise = max(np.mean(self.q), self.missed / max(self.expected, 1e-300) * d2)
         if self.exact:
-            doubt = np.mean(self.q) * self.n / self.count
+            doubt = np.mean(self.q) * self.n / max(self.count, 1.0)
         else:
             doubt = np.mean(self.q) * np.sum((self.theta[self.K :] @ Z.T) ** 2) / (self.B * core.DRAWS)
         limit = core.SURPRISE * (noise + doubt)
@@ -184,7 +184,7 @@ class Plant:
         surprised = missed > limit
         if surprised and at_last <= limit:
             return False  # over already
-        self.missed = self.forget * self.missed + min(missed, d2)
+        self.missed = self.forget * self.missed + missed
         self.expected = self.forget * self.expected + d2
         if surprised:
             self.spread, self.waiting, self.surprises = core.REDRAWN, True, self.surprises + 1
@@ -195,16 +195,15 @@ class Plant:
     def add(self, Z, d, e, new):
         """Add the block, or its newest samples; if there are none, what the posterior expects: nothing changes then."""
         rows = new or self.B
-        w, f = self.g ** (np.arange(rows - 1, -1, -1) / 2), self.g**rows
-        Z = Z[-rows:] * w[:, None]
-        told, noise = self.theta @ Z.T, self.q * np.sum(w**2)
+        f, samples, Z = self.g**rows, np.sum(self.g ** np.arange(rows)), Z[-rows:]
+        told, noise = self.theta @ Z.T, self.q * samples
         if new:
-            told, noise = np.concatenate([e[:, -rows:] * w, self.signs(core.DRAWS, rows)[:, ::-1]]), 0.0
+            told, noise = np.concatenate([e[:, -rows:], self.signs(core.DRAWS, rows)[:, ::-1]]), 0.0
         energy = np.sum(told[: self.K] ** 2, axis=1) + noise
         fade = np.repeat([f, math.sqrt(f)], [self.K, core.DRAWS])[:, None]  # unit noise is drawn for faded samples
         self.before, self.G, self.r = f * self.before, f * self.G + Z.T @ Z, fade * self.r + told @ Z
-        self.ee, self.count = f * self.ee + energy, f * self.count + np.sum(w**2)
-        self.explained = f * self.explained + np.sum(w**2) * np.sum(d**2) / self.B
+        self.ee, self.count = f * self.ee + energy, f * self.count + samples
+        self.explained = f * self.explained + samples * np.sum(d**2) / self.B
 
     def fit(self):
         """Take some steps towards (G + q P) theta = r + q P mean, and estimate q; return False if nothing can be told."""
@@ -236,14 +235,13 @@ class Plant:
         theta = self.theta[:K]
         residual = np.maximum(self.ee + np.sum(theta * (theta @ self.G - 2 * self.r[:K]), axis=1), 0.0)
         # The noise, with the earlier estimate counting as n samples: a short record leaves little noise by chance.
-        counted = max(self.count - split / 2, 0.0) + self.n
-        self.q = np.maximum((residual + self.n * self.q) / counted, 1e-6 * self.ee / self.count)
+        self.q = np.maximum((residual + self.n * self.q) / (self.count + self.n), 1e-6 * self.ee / self.count)
         self.theta[K:] *= min(math.sqrt(q / np.mean(self.q)), 1.0)  # if q rises, draws keep their size
         # By chance alone, n taps explain n q. James and Stein: what is not significant is not played.
         explained = np.sum(theta[:, :split] @ self.G[:split, :split] * theta[:, :split])
         self.significant = max(0.0, 1.0 - 2 * split * np.sum(self.q) / max(explained, 1e-300))
         self.explained = self.significant**2 * explained
-        self.fits, self.fresh, self.taught = self.fits + 1, False, self.energy_of(slice(I, None))
+        self.fits, self.fresh = self.fits + 1, False
         return True
 
     def paths(self):
@@ -297,11 +295,8 @@ class PowerBudget(Controller):
         self.window, self.short = (Window(I, self.N, g, self.B) for g in (self.g, self.g**core.SHORTER))
         self.x_past, self.y_past = np.zeros((I, self.N - 1 + self.B)), np.zeros((J, self.N - 1 + self.B))
         self.new, self.asked = [], []  # samples of this block: x, y, e; the squares asked for
-        self.peak, self.e_peak, self.heard = (
-            np.zeros(I),
-            np.zeros(len(self.s_hat)),
-            0,
-        )  # of |x|, |e| of late; samples that the delay lines hold, as they were
+        self.peak, self.e_peak = np.zeros(I), np.zeros(len(self.s_hat))  # of |x| and |e| of late
+        self.heard = 0  # samples that the delay lines hold, as they were
         self.blocks = max(round(self.averaging_s * self.fs / self.B), core.BLOCK_LASTS)  # T, of the averaging time
         self.book = np.ones((self.blocks, J))  # power of each block over the rating, newest first: all is spent
         self.set_room()
@@ -403,16 +398,12 @@ class PowerBudget(Controller):
     def next_price(self, price, v, target):
         """Return prices after a step of Newton's method for the powers, of which power^-1/2 is nearly a line.
 
-        The slopes are -2 u_i' A^-1 u_j, u_j = R v_j; the preconditioner stands for A^-1.
+        The slopes are -2 u_i' A^-1 u_j, u_j = R v_j; the preconditioner stands for A^-1. The sums of their sizes over j are
+        slopes as well, with which no price moves too far if all move.
         """
         u, power = v @ self.R, power_of(v, self.R)
         H = np.einsum("jm,jman,an->ja", u, self.W.reshape(u.shape * 2), u, optimize=True)
-        free = (price > 0) | (power > target)
-        size = np.where(free, 1 / np.sqrt(np.maximum(np.diag(H), 1e-300)), 0.0)
-        H = H * np.outer(size, size) + np.diag(np.where(free, core.REGULAR, 1.0))
-        step = size * np.linalg.solve(H, size * power * (np.sqrt(power / target) - 1))
-        if not step @ (power - target) > 0:
-            step = size * np.linalg.solve(H, size * (power - target) / 2)
+        step = power * (np.sqrt(power / target) - 1) / np.maximum(np.sum(abs(H), axis=1), 1e-300)
         price = np.maximum(price + step, 0.0)
         return np.where(price < 1e-9 * self.gain, 0.0, price)
 

@@ -45,8 +45,8 @@ COVARIANCE = {
 }
 BUDGET = {
     "start_fourier": 1000,
-    **dict.fromkeys(("transform_complex", "set_right", "set_theta"), 100),
-    **dict.fromkeys(("add_lags", "dot", "explain"), 30),
+    **dict.fromkeys(("transform_complex", "set_right", "path_of"), 100),
+    **dict.fromkeys(("add_lags", "dot", "respond"), 30),
 }
 ANY_ANSWER = (  # of the processor, of which Eva knows nothing
     (
@@ -302,7 +302,7 @@ BUDGET_FAULTS = {
         "scratch_row(f, 1)), (size_t)f->F + 1);",
     ),
     "a sample too many transformed": ("fourier.c", "k < n && k < H; k++) {", "k <= n && k < H; k++) {"),
-    "a lag too many": ("fourier.c", "l < lags; l++) to[l] +=", "l <= lags; l++) to[l] +="),
+    "a lag too many": ("fourier.c", "add_scaled(to + first, 1, U, now);", "add_scaled(to + first, 1, U, now + 1);"),
     "a history moved too far": ("posterior.c", "(size_t)(f->history - f->B));", "(size_t)(f->history - f->B + 1));"),
     "an error too late": ("posterior.c", "at = f->B - 1 - f->heard[FILLED]", "at = f->B - f->heard[FILLED]"),
     "a click of no microphone": ("budget.c", "f->peak + s->I + k)", "f->peak + s->I + k + 1)"),
