@@ -246,7 +246,6 @@ static void set_equations(budget *f)
 {
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
-    const size_t each = (size_t)F->F;
     real *sums = f->spectra, *lags = scratch_row(F, 3), *behind = scratch_row(F, 4);
     correlate_paths(f);
     for (int32_t j = 0; j < J; j++)
@@ -260,35 +259,27 @@ static void set_equations(budget *f)
     for (int32_t ji = 0; ji < J * I; ji++)
         for (int32_t ac = 0; ac <= ji; ac++) {
             const int32_t j = ji / I, i = ji % I, a = ac / I, c = ac % I;
-            clear(sums, each);
-            add_product(F, sums, f->SS + times(j * J + a, F->F), f->R_at + times(i * I + c, F->F),
-                        1, 1);
+            multiply_row(F, sums, f->SS + times(j * J + a, F->F), f->R_at + times(i * I + c, F->F),
+                         1);
             transform_back(F, lags, sums, F->F);
             for (int32_t l = 1; l < L; l++) behind[l] = -lags[F->F - l]; /* it is skew */
             transform_lags(F, f->smooth_A + times(ji * J * I + ac, F->F), lags, behind, L, 1);
         }
 }
 
-/* Set to_i = sum_c R_ic v_c for a filter v, (I, L), of one loudspeaker. */
-static void multiply_references(budget *f, const real *R, real *to, const real *v)
+/* Return the power of loudspeaker j with the filters v; R v is left in `to`, (I, L). */
+static real power_of(budget *f, const real *R, const real *v, int32_t j, real *to)
 {
     const int32_t I = f->s.I, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
-    const size_t each = (size_t)F->F;
+    const real *own = v + times(j, I * L);
     real *sums = scratch_row(F, 2);
-    for (int32_t c = 0; c < I; c++) transform(F, f->spectra + (size_t)c * each, v + times(c, L), L);
+    for (int32_t i = 0; i < I; i++) transform(F, f->spectra + times(i, F->F), own + times(i, L), L);
     for (int32_t i = 0; i < I; i++) {
         multiply_row(F, sums, R + times(i * I, F->F), f->spectra, I);
         transform_back(F, to + times(i, L), sums, L);
     }
-}
-
-/* Return the power of loudspeaker j with the filters v; R v is left in `to`, (I, L). */
-static real power_of(budget *f, const real *R, const real *v, int32_t j, real *to)
-{
-    const int32_t n = f->s.I * f->s.L;
-    multiply_references(f, R, to, v + times(j, n));
-    return dot(to, v + times(j, n), n);
+    return dot(to, own, I * L);
 }
 
 /* Set to = (A + price R) v for all filters. */
