@@ -27,7 +27,7 @@ BAND_HZ = (100.0, 2000.0)
 SENSOR_NOISE = 0.01
 AFTER_S = 10.0  # that are judged after an event
 SEED = 1
-EVENTS: dict[str, tuple[str, float, dict[str, float | None]]] = {  # by name: what changes, when in s, settings of KF-PB
+EVENTS: dict[str, tuple[str, float, dict[str, float]]] = {  # by name: what changes, when in s, settings of KF-PB
     "nothing": ("nothing", 8.0, {}),
     "start without a silent run": ("nothing", 0.0, {}),
     "start, ample power": ("nothing", 0.0, {"rated_power": 20.0}),
@@ -54,11 +54,6 @@ EVENTS: dict[str, tuple[str, float, dict[str, float | None]]] = {  # by name: wh
             "microphone clips at 0.5": 0.0,
         }.items()
     },
-    "drift of 20 %, exact path": (
-        "drift of 20 % of a sample a second",
-        4.0,
-        {"secondary_path_uncertainty": None},
-    ),
     "averaging_s=600, sign at 30 s": ("primary path's sign", 30.0, {"averaging_s": 600.0}),
     "averaging_s=1, sign at 8 s": ("primary path's sign", 8.0, {"averaging_s": 1.0}),
     "48 kHz": ("nothing", 4.0, {"fs": 48000.0}),

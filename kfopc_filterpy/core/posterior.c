@@ -4,8 +4,10 @@
  * recording reaches between seven and eight times its mean where the path is longer than the
  * model. */
 static const real SURPRISE = 10;
-/* rms error over the path, if it gave way to an independent one of the same size: sqrt(2). */
-static const real REDRAWN = (real)1.4142135623730951;
+/* rms error over the secondary path: if an independent one of the same size has replaced it,
+ * sqrt(2); if the primary path alone has changed, so little that a drift of the primary path is not
+ * taken for an error of both. */
+static const real REDRAWN = (real)1.4142135623730951, HELD = (real)1e-3;
 /* An error that is over before the last of so many parts of a block is a click or a clipped peak,
  * not another plant. */
 enum { PARTS_OF_BLOCK = 8 };
@@ -518,9 +520,13 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     known->expected = forget * known->expected + is->expected;
     if (!surprised) return 1;
     count_up(f->alarms);
-    known->spread = REDRAWN;
     f->counts[WAITING] = 1;
     f->counts[SILENT] = is->heard >= is->expected; /* the control does no good: listen to p alone */
+    /* If it does good, s is as before, unless that was wrong at the last surprise. */
+    known->spread = f->counts[SILENT] || known->spread <= HELD ? REDRAWN : HELD;
+    for (int32_t k = 0; k < f->K; k++)
+        for (int32_t c = f->I; c < f->C; c++)
+            copy(taps_of(f, f->prior, k, c), taps_of(f, f->theta, k, c), (size_t)f->M);
     begin_data(f, 0);
     return 0;
 }

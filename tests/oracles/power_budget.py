@@ -187,8 +187,10 @@ class Plant:
         self.missed = self.forget * self.missed + missed
         self.expected = self.forget * self.expected + d2
         if surprised:
-            self.spread, self.waiting, self.surprises = core.REDRAWN, True, self.surprises + 1
+            self.waiting, self.surprises = True, self.surprises + 1
             self.silent = heard >= d2  # the control does no good: listen to p alone
+            self.spread = core.REDRAWN if self.silent or self.spread <= core.HELD else core.HELD
+            self.mean[:, self.split :] = self.theta[: self.K, self.split :]
             self.begin(z, 0)
         return not surprised
 
