@@ -21,7 +21,7 @@ from kfopc_filterpy.bounds import (
 )
 from kfopc_filterpy.bounds.wiener import full_stretch
 from kfopc_filterpy.controllers import Controller
-from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S, DEFAULT_UNCERTAINTY
+from kfopc_filterpy.controllers.kf_pb import DEFAULT_AVERAGING_S
 from kfopc_filterpy.plant import checked_references, has_one_channel
 from kfopc_filterpy.power.amplifiers import Amplifier
 from kfopc_filterpy.verdict.candidates import filtered_power
@@ -116,8 +116,7 @@ class Scene:
     secondary_estimate : ndarray, optional
         Secondary path that controllers know; by default the true one.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        Uncertainty of that path that KF-PB takes account of, see `paths.path_uncertainty`; by default KF-PB's own. None:
-        the path is exact.
+        Uncertainty of that path that KF-PB takes account of, see `paths.path_uncertainty`; by default none.
     known_amplifier : amplifier, optional
         Amplifier that disturbance estimates know; by default they take it to be linear.
     power_memory_s : float, default 0.5
@@ -144,7 +143,7 @@ class Scene:
     wiener_noise_reduction_db: float = 0.0
     seeds: list[int] = field(default_factory=list)
     secondary_estimate: np.ndarray | None = None
-    secondary_path_uncertainty: Any = DEFAULT_UNCERTAINTY
+    secondary_path_uncertainty: Any = None
     known_amplifier: Amplifier | Sequence[Amplifier] | None = None
     power_memory_s: float = 0.5
     power_window: str = "exponential"

@@ -217,6 +217,7 @@ def _task(
     noise: Mapping[str, Any],
     change: str = "nothing",
     changed_at_s: float = 0.0,
+    path_error: float | None = None,
     averaging_s: float = DEFAULT_AVERAGING_S,
     other_packages: bool = True,
 ) -> Task:
@@ -239,6 +240,7 @@ def _task(
     told = {
         "references": sound,
         "disturbances": [changed.disturbance(delayed.disturbance(x), at, fs) for x in sound],
+        "secondary_path_uncertainty": path_error,
         "averaging_s": averaging_s,
     }
     task = Task(

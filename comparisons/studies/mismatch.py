@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import Plant
+from kfopc_filterpy.controllers.kf_pb import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
 
@@ -132,8 +133,9 @@ def estimates(secondary: np.ndarray) -> dict[Point, np.ndarray]:
 
 
 def case_scene(case: Case, plant: Plant) -> Scene:
-    """Return the scene of a case with the exact path."""
-    return driven_case(plant, noise_of(case.noise, DURATION_S), OVERDRIVE_DB)
+    """Return the scene of a case with the exact path, of which KF-PB is not told that it is."""
+    scene = driven_case(plant, noise_of(case.noise, DURATION_S), OVERDRIVE_DB)
+    return replace(scene, secondary_path_uncertainty=DEFAULT_UNCERTAINTY)
 
 
 def run_case(
