@@ -8,7 +8,7 @@
  * filters of all loudspeakers become those of least expected error at the prices of their powers,
  * (A + price R) v = b: A is the correlation of the filtered references, R that of the references, b
  * theirs with the disturbance. Both are Toeplitz for each pair of filters. A few steps of conjugate
- * gradients from the last solution approach the filters, and a step of Newton's method the prices.
+ * gradients from the last solution approach the filters, and a step near to Newton's the prices.
  * N = L + M - 1 taps of a primary path are all that control can reach. */
 #include "posterior.h"
 
@@ -62,9 +62,9 @@ typedef struct {
     real *b;                  /* (J, I, L) */
     real *spectra, *products; /* (J, I), (J, I) spectra */
     real *vectors;            /* (4, J, I, L) */
-    real *small;              /* (4, J) slopes, and see `solve_all` */
+    real *small;              /* (4, J) slopes, levels, powers, and what is afforded */
     real *window;             /* (I, B + N - 1) */
-    real *work;               /* (B + N) of a path, or of a block */
+    real *work;               /* of a path, (N), or of a block, (B) */
 } budget;
 typedef char budget_fits_into_a_view[sizeof(budget) <= sizeof(anc_view) ? 1 : -1];
 
@@ -121,9 +121,9 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     f->spectra = reals(at, "filter_spectra", ANC_SCRATCH, 1, J, I, spectrum);
     f->products = reals(at, "filter_products", ANC_SCRATCH, 1, J, I, spectrum);
     f->vectors = reals(at, "filter_vectors", ANC_SCRATCH, 4, J, I, L);
-    f->small = reals(at, "dual", ANC_SCRATCH, 1, 1, 4, J);
+    f->small = reals(at, "of_loudspeakers", ANC_SCRATCH, 1, 1, 4, J);
     f->window = reals(at, "windowed", ANC_SCRATCH, 1, 1, I, B + N - 1);
-    f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, 1, B + N);
+    f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, 1, B > N ? B : N);
 }
 
 /* Set what each loudspeaker may spend in the next block, whatever its filter asks for. */
@@ -365,9 +365,9 @@ static void set_slopes(budget *f, real *slope)
     }
 }
 
-/* Make a step of Newton's method with the prices, of which power^-1/2 is nearly a line, with the
- * slopes power^-3/2 u'A^-1 u. Each price moves as if all others moved with it, so together they do
- * not go too far. Return whether a price has changed. */
+/* Move the prices towards the targets, and return whether one has changed. power^-1/2 is nearly a
+ * line in a price, with the slope power^-3/2 u'A^-1 u. For u'A^-1 u stands the sum of sizes in its
+ * row, so that no price goes too far if all move. */
 static int next_prices(budget *f, const real *power, const real *target)
 {
     real *slope = f->small;
@@ -451,6 +451,15 @@ static void solve_all(budget *f)
 }
 
 /* A sample. */
+
+static int is_too_loud(const signals *s, const real *reference)
+{
+    for (int32_t i = 0; i < s->I; i++) {
+        const real x = reference_of(s, reference, i);
+        if (!within(x, anc_loudest_learnt) || !within(x, *s->loudest)) return 1;
+    }
+    return 0;
+}
 
 static void end_block(budget *f)
 {

@@ -23,9 +23,9 @@ void layout_fourier(fourier *f, int32_t N, anc_layout *at);
 void start_fourier(const fourier *f);
 /* Transform n <= F numbers, with zeros after them. */
 void transform(const fourier *f, real *spectrum, const real *from, int32_t n);
-/* Set `to` to the first n of the F numbers of a spectrum. */
+/* Set `to` to the first n of the F numbers of a spectrum; n <= F. */
 void transform_back(const fourier *f, real *to, const real *spectrum, int32_t n);
-/* Add sum_k u(k) v(k + l), k < n, to to_l, l < lags. */
+/* Add sum_k u(k) v(k + l), k < n, to to_l, l < lags; v has n + lags - 1 numbers. */
 void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *v, int32_t lags);
 /* Set a spectrum to that of ahead_l at lags l and behind_l at lags -l, l < n, under a triangle that
  * ends at lag n if `smooth`: then a definite Toeplitz matrix gives a definite circulant near to it,

@@ -19,12 +19,12 @@ enum { PLANT_STEPS = 8 };
 void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, anc_layout *at)
 {
     const int32_t K = s->K, J = s->J, I = s->I, M = s->M, N = s->L + M - 1;
-    const int32_t C = I + (exact ? 0 : J), draws = exact ? 0 : DRAWS, rows = K + draws;
+    const int32_t C = I + (exact ? 0 : J), rows = K + (exact ? 0 : DRAWS);
     *f = (posterior){.K = K, .J = J, .I = I, .N = N, .M = M, .B = block, .exact = exact};
     f->n = I * N + (exact ? 0 : J * M);
     f->C = C;
     f->rows = rows;
-    f->history = N + block;
+    f->history = block + N - 1;
     f->path = s->path;
     layout_fourier(&f->fourier, N, at);
     const int32_t spectrum = f->fourier.F;
@@ -49,14 +49,14 @@ void layout_posterior(posterior *f, const signals *s, int32_t block, int exact, 
     f->before_at = reals(at, "before_spectra", ANC_SCRATCH, 1, 1, C, spectrum);
     f->spectra = reals(at, "posterior_spectra", ANC_SCRATCH, 1, 1, C + 1, spectrum);
     f->products = reals(at, "posterior_products", ANC_SCRATCH, 1, 1, C, spectrum);
-    f->taper = reals(at, "taper", ANC_SCRATCH, 1, 1, 1, block + N - 1);
-    f->faded = reals(at, "faded", ANC_SCRATCH, 1, 1, C, block + N - 1);
+    f->taper = reals(at, "taper", ANC_SCRATCH, 1, 1, 1, f->history);
+    f->faded = reals(at, "faded", ANC_SCRATCH, 1, 1, C, f->history);
     f->right = reals(at, "right_side", ANC_SCRATCH, 1, 1, C, N);
     f->vectors = reals(at, "posterior_vectors", ANC_SCRATCH, 1, 4, C, N);
-    f->work = reals(at, "posterior_work", ANC_SCRATCH, 1, 1, POSTERIOR_ROWS, f->history);
+    f->work = reals(at, "posterior_work", ANC_SCRATCH, 1, 1, POSTERIOR_ROWS, block);
 }
 
-static real *work_of(const posterior *f, int32_t row) { return f->work + times(row, f->history); }
+static real *work_of(const posterior *f, int32_t row) { return f->work + times(row, f->B); }
 
 /* Return the taps of signal c in a row of vectors. */
 static real *taps_of(const posterior *f, real *vectors, int32_t row, int32_t c)
@@ -88,10 +88,9 @@ void start_posterior(posterior *f, real spread)
     f->counts[RANDOM] = 1;
     start_fourier(&f->fourier);
     for (int32_t k = 0; k < f->K; k++)
-        for (int32_t c = f->I; c < f->C; c++) {
+        for (int32_t c = f->I; c < f->C; c++)
             copy(taps_of(f, f->prior, k, c), given_path(f, k, c), (size_t)f->M);
-            copy(taps_of(f, f->theta, k, c), given_path(f, k, c), (size_t)f->M);
-        }
+    copy(f->theta, f->prior, times(f->K * f->C, f->N));
     for (int32_t row = f->K; row < f->rows; row++)
         for (int32_t c = 0; c < f->C; c++)
             for (int32_t i = 0; i < f->N; i++) {
@@ -124,12 +123,12 @@ static real mean_noise(const posterior *f)
 /* Return the precision of the taps of signal c. */
 static real precision_of(const posterior *f, int32_t c)
 {
-    return c < f->I ? f->numbers->prior : f->numbers->prior_s;
+    return c < f->I ? f->numbers->precision : f->numbers->precision_s;
 }
 
 /* Set the precisions: of the primary paths from |p|^2 = E[d^2 + e^2] / E[x^2] of the data of now.
  * Guess the first noise: -30 dB, which counts as n samples. Return 0 if nothing can be told yet. */
-static int set_prior(posterior *f)
+static int set_precisions(posterior *f)
 {
     posterior_numbers *known = f->numbers;
     real x2 = 0, e2 = 0, q = 0;
@@ -141,8 +140,8 @@ static int set_prior(posterior *f)
     }
     if (!(x2 > 0)) return 0;
     const real spread = known->spread;
-    known->prior_s = f->exact ? 0 : (real)f->M / (spread * spread * size_of_path(f));
-    known->prior = x2 * (real)f->N * (real)f->K / (e2 + known->explained);
+    known->precision_s = f->exact ? 0 : (real)f->M / (spread * spread * size_of_path(f));
+    known->precision = x2 * (real)f->N * (real)f->K / (e2 + known->explained);
     for (int32_t k = 0; q == 0 && k < f->K; k++) f->q[k] = (real)1e-3 * f->ee[k] / known->samples;
     return 1;
 }
@@ -166,7 +165,7 @@ static void leave_out(posterior *f, const real *edge, const real *T, real *out, 
         add_product(F, out + (size_t)c * each, edge + (size_t)c * each, sums, -1, turn);
 }
 
-/* Set to = (G + q P) t, or without the prior. */
+/* Set to = (G + q P) t; with q = 0, without the prior. */
 static void multiply_data(posterior *f, real *to, const real *t, real q)
 {
     const fourier *F = &f->fourier;
@@ -178,15 +177,14 @@ static void multiply_data(posterior *f, real *to, const real *t, real q)
         multiply_row(F, out + (size_t)a * each, f->T_at + times(a * C, F->F), T, C);
     leave_out(f, f->ahead_at, T, out, 1, N, 1);
     leave_out(f, f->before_at, T, out, 0, N - 1, -1);
-    real *part = scratch_row(F, 2);
     for (int32_t c = 0; c < C; c++) {
         const int32_t n = taps_in(f, c);
         const real ridge = q * precision_of(f, c);
         real *restrict sums = to + times(c, N);
-        transform_back(F, part, out + (size_t)c * each, n);
+        transform_back(F, sums, out + (size_t)c * each, n);
         for (int32_t i = 0; i < n; i++)
-            sums[i] = part[i] + ridge * f->taper[i] * f->taper[i] * t[times(c, N) + (size_t)i];
-        for (int32_t i = n; i < N; i++) sums[i] = 0;
+            sums[i] += ridge * f->taper[i] * f->taper[i] * t[times(c, N) + (size_t)i];
+        clear(sums + n, (size_t)(N - n));
     }
 }
 
@@ -219,7 +217,7 @@ static void prepare(posterior *f, real q)
         }
     factorise_spectra(F, f->factor, C);
     for (int32_t c = 0; c < C; c++) {
-        transform(F, f->ahead_at + times(c, F->F), f->faded + times(c, f->B + N - 1), N);
+        transform(F, f->ahead_at + times(c, F->F), f->faded + times(c, f->history), N);
         transform(F, f->before_at + times(c, F->F), f->before + times(c, N), N - 1);
     }
 }
@@ -229,12 +227,12 @@ static void set_right(posterior *f, int32_t row, real q)
 {
     for (int32_t c = 0; c < f->C; c++) {
         const real *r = taps_of(f, f->r, row, c), *prior = taps_of(f, f->prior, row, c);
-        const real ridge = q * precision_of(f, c),
-                   share = row < f->K ? 1 : 1 / root(larger(ridge, NEARLY_ZERO));
+        const real ridge = q * precision_of(f, c);
+        const real size = row < f->K ? 1 : 1 / root(larger(ridge, NEARLY_ZERO)); /* of a draw */
         real *restrict right = f->right + times(c, f->N), *t = taps_of(f, f->solution, row, c);
         for (int32_t i = 0; i < f->N; i++) {
-            right[i] = r[i] + ridge * share * f->taper[i] * prior[i];
-            if (f->counts[FRESH]) t[i] = share * prior[i] / f->taper[i];
+            right[i] = r[i] + ridge * size * f->taper[i] * prior[i];
+            if (f->counts[FRESH]) t[i] = size * prior[i] / f->taper[i];
         }
     }
 }
@@ -244,12 +242,14 @@ static real noise_of(posterior *f, int32_t k)
 {
     const real samples = f->numbers->samples, n = (real)f->n;
     const real *t = taps_of(f, f->solution, k, 0), *r = taps_of(f, f->r, k, 0);
-    real *product = f->vectors, residual = f->ee[k];
+    const int32_t all = f->C * f->N;
+    real *product = f->vectors;
     multiply_data(f, product, t, 0);
-    for (int32_t i = 0; i < f->C * f->N; i++) residual += t[i] * (product[i] - 2 * r[i]);
-    /* The earlier estimate counts as n samples: a short record leaves little noise by chance. Below
-     * -60 dB, it could be rounding. */
-    const real noise = (larger(residual, 0) + n * f->q[k]) / (samples + n);
+    const real residual = f->ee[k] + dot(t, product, all) - 2 * dot(t, r, all);
+    /* A short record leaves little noise by chance: half of the taps of p count as fitted to noise,
+     * and the earlier estimate as n samples. Below -60 dB, it could be rounding. */
+    const real fitted = larger(samples - (real)(f->I * f->N) / 2, 0);
+    const real noise = (larger(residual, 0) + n * f->q[k]) / (fitted + n);
     return larger(noise, (real)1e-6 * f->ee[k] / samples);
 }
 
@@ -298,10 +298,15 @@ static void solve_row(posterior *f, int32_t row, real q)
     approach(&own, f->right, taps_of(f, f->solution, row, 0), PLANT_STEPS);
 }
 
+static void count_up(int32_t *count)
+{
+    if (*count < 1 << 30) ++*count;
+}
+
 /* Approach the posterior of the data; return 0 if nothing can be told yet. */
 static int approach_posterior(posterior *f)
 {
-    if (!set_prior(f)) return 0;
+    if (!set_precisions(f)) return 0;
     const int32_t draws = f->rows - f->K;
     const real q = mean_noise(f), renewed = (real)(f->B * draws) / f->numbers->samples;
     prepare(f, q);
@@ -348,23 +353,26 @@ void begin_block(posterior *f)
 /* Set the taper, and the faded signals. */
 static void fade_signals(posterior *f, real forget)
 {
-    const int32_t length = f->B + f->N - 1;
     const real g = root(forget);
     real share = 1;
-    for (int32_t i = 0; i < length; i++, share *= g) {
+    for (int32_t i = 0; i < f->history; i++, share *= g) {
         f->taper[i] = share;
         for (int32_t c = 0; c < f->C; c++)
-            f->faded[times(c, length) + (size_t)i] =
+            f->faded[times(c, f->history) + (size_t)i] =
                 (c < f->I ? share : -share) * history_of(f, c)[i];
     }
 }
 
+/* Return what the n newest faded samples count. */
+static real count_of(const posterior *f, int32_t n) { return dot(f->taper, f->taper, n); }
+
 static const real *faded_of(const posterior *f, int32_t c)
 {
-    return f->faded + times(c, f->B + f->N - 1);
+    return f->faded + times(c, f->history);
 }
 
-/* Set `to` to what a row hears of the signals from `begin` to `end` in the n newest samples. */
+/* Set `to` to the faded response of a row to the signals from `begin` to `end`, in the n newest
+ * samples. */
 static void respond(const posterior *f, int32_t row, int32_t begin, int32_t end, int32_t n,
                     real *to)
 {
@@ -374,8 +382,8 @@ static void respond(const posterior *f, int32_t row, int32_t begin, int32_t end,
                  n);
 }
 
-/* Return the mean power of the doubt in a block: that of the draws; without draws, what n unknown
- * taps add. */
+/* Return the mean power of the doubt in a faded block: that of the draws; without draws, what n
+ * unknown taps add. */
 static real power_of_doubt(const posterior *f)
 {
     const real q = mean_noise(f);
@@ -383,9 +391,9 @@ static real power_of_doubt(const posterior *f)
     if (f->exact) return q * (real)f->n / larger(f->numbers->samples, 1);
     for (int32_t row = f->K; row < f->rows; row++) {
         respond(f, row, 0, f->C, f->B, heard);
-        doubt += dot(heard, heard, f->B) / (real)f->B;
+        doubt += dot(heard, heard, f->B);
     }
-    return q * doubt / (real)DRAWS;
+    return q * doubt / ((real)DRAWS * count_of(f, f->B));
 }
 
 /* Let the data go, and begin with the newest samples of the block. */
@@ -419,9 +427,8 @@ static void let_fade(real *sums, size_t n, real share)
     for (size_t i = 0; i < n; i++) sums[i] = faded(sums[i], share, 0);
 }
 
-/* Set `heard` to the faded errors of a row in the newest samples: what a microphone hears, or a
- * draw's noise. What is not to be believed is what the row expects, with its noise: it changes
- * nothing. */
+/* Set `heard` to what a row hears in the newest samples: the errors, which `judge` has faded, or a
+ * draw's unit noise. If they are not believed, it hears what it expects, which changes nothing. */
 static void hear_row(posterior *f, int32_t row, int32_t newest, int believed, real *heard)
 {
     if (!believed)
@@ -440,7 +447,7 @@ static void add_samples(posterior *f, int32_t newest, int believed, real expecte
     const real share = raised(forget, newest);
     posterior_numbers *known = f->numbers;
     real *heard = work_of(f, 0);
-    const real of_weights = dot(f->taper, f->taper, newest);
+    const real count = count_of(f, newest);
     let_fade(f->before, times(C, N), root(share));
     let_fade(f->T, times(C * C, N), share);
     let_fade(f->r, times(f->K * C, N), share);
@@ -455,11 +462,11 @@ static void add_samples(posterior *f, int32_t newest, int believed, real expecte
             add_lags(&f->fourier, taps_of(f, f->r, row, c), heard, newest, faded_of(f, c),
                      taps_in(f, c));
         if (row >= f->K) continue;
-        const real noise = believed ? 0 : f->q[row] * of_weights;
+        const real noise = believed ? 0 : f->q[row] * count; /* which it expects, too */
         f->ee[row] = share * f->ee[row] + dot(heard, heard, newest) + noise;
     }
-    known->samples = share * known->samples + of_weights;
-    known->explained = share * known->explained + of_weights / (real)f->B * expected;
+    known->samples = share * known->samples + count;
+    known->explained = share * known->explained + expected;
 }
 
 /* Return how many samples are the last part of a block. */
@@ -468,12 +475,12 @@ static int32_t last_part(const posterior *f)
     return f->B - f->B * (PARTS_OF_BLOCK - 1) / PARTS_OF_BLOCK;
 }
 
-/* Energies of a block over the microphones: of what the posterior does not explain, in all and at
- * last, of d^ and of the errors. */
+/* Energies of a faded block over the microphones: of what the posterior does not explain, in all
+ * and at last, and of d^; and of the errors, before they fade. */
 typedef struct { real missed, missed_at_last, expected, heard; } judgement;
 
-/* Judge a block, whose errors fade. If s^ is exact, add what is played to them, because it teaches
- * nothing. */
+/* Judge a block. Its errors are overwritten: they fade, and if s^ is exact, what is played is
+ * added, because it teaches nothing. */
 static judgement judge(posterior *f)
 {
     const int32_t B = f->B;
@@ -504,7 +511,7 @@ static judgement judge(posterior *f)
 static int notice_surprise(posterior *f, const judgement *is, real forget)
 {
     posterior_numbers *known = f->numbers;
-    const real each = (real)f->B * (real)f->K;
+    const real count = count_of(f, f->B), each = count * (real)f->K;
     /* The noise grows with the disturbance, as it did before. */
     const real grown =
         known->expected > 0 ? known->missed / known->expected * is->expected / each : 0;
@@ -513,15 +520,17 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     if (surprised) {
         const real limit = SURPRISE * (noise + power_of_doubt(f));
         surprised = is->missed > limit * each;
-        if (surprised && is->missed_at_last <= limit * (real)(last_part(f) * f->K)) return 0;
+        if (surprised && is->missed_at_last <= limit * count_of(f, last_part(f)) * (real)f->K)
+            return 0;
     }
     forget = raised(forget, f->B);
-    known->missed = forget * known->missed + is->missed;
+    known->missed = forget * known->missed + smaller(is->missed, is->expected);
     known->expected = forget * known->expected + is->expected;
     if (!surprised) return 1;
     count_up(f->alarms);
     f->counts[WAITING] = 1;
-    f->counts[SILENT] = is->heard >= is->expected; /* the control does no good: listen to p alone */
+    /* If the control does no good, listen to p alone. */
+    f->counts[SILENT] = is->heard / (real)f->B >= is->expected / count;
     /* If it does good, s is as before, unless that was wrong at the last surprise. */
     known->spread = f->counts[SILENT] || known->spread <= HELD ? REDRAWN : HELD;
     for (int32_t k = 0; k < f->K; k++)

@@ -46,7 +46,7 @@ WITHOUT = {  # the value that takes a constant out of effect, or makes it as sma
     "LOUDER": "1e30",
     "SURPRISE": "1e9",
     "REDRAWN": "0.1",  # what is known before a surprise
-    "HELD": "REDRAWN",
+    "HELD": "9",  # then it is REDRAWN
     "PARTS_OF_BLOCK": "1",
     "PLANT_STEPS": "1",
 }

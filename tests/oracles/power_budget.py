@@ -157,7 +157,7 @@ class Plant:
         d = self.significant * self.theta[:K, : self.split] @ Z[:, : self.split].T
         if new and known:
             missed = np.mean((e - d - self.theta[:K, self.split :] @ Z[:, self.split :].T) ** 2, axis=0)
-            new = new if self.believes(missed, np.mean(d**2), heard, z, Z) else 0
+            new = new if self.believes(missed, np.sum(d**2) / (K * np.sum(w**2)), heard, z, Z, w) else 0
         x2, y2 = (np.sum((z[part, -self.B :] * w) ** 2) for part in (slice(I), slice(I, None)))
         x2_of_data, y2_of_data = self.energy_of(slice(I)), self.energy_of(slice(I, None))
         if new:
@@ -171,20 +171,20 @@ class Plant:
         if new and self.fit() and new == self.B:
             self.waiting = self.silent = False
 
-    def believes(self, missed, d2, heard, z, Z):
+    def believes(self, missed, d2, heard, z, Z, w):
         """Return whether a block is to be believed; forget all if it tells of another plant."""
         noise = max(np.mean(self.q), self.missed / max(self.expected, 1e-300) * d2)
         if self.exact:
             doubt = np.mean(self.q) * self.n / max(self.count, 1.0)
         else:
-            doubt = np.mean(self.q) * np.sum((self.theta[self.K :] @ Z.T) ** 2) / (self.B * core.DRAWS)
+            doubt = np.mean(self.q) * np.sum((self.theta[self.K :] @ Z.T) ** 2) / (np.sum(w**2) * core.DRAWS)
         limit = core.SURPRISE * (noise + doubt)
         last = self.B * (core.PARTS_OF_BLOCK - 1) // core.PARTS_OF_BLOCK
-        at_last, missed = np.mean(missed[last:]), np.mean(missed)
+        at_last, missed = (np.sum(missed[i:]) / np.sum(w[i:] ** 2) for i in (last, 0))
         surprised = missed > limit
         if surprised and at_last <= limit:
             return False  # over already
-        self.missed = self.forget * self.missed + missed
+        self.missed = self.forget * self.missed + min(missed, d2)
         self.expected = self.forget * self.expected + d2
         if surprised:
             self.waiting, self.surprises = True, self.surprises + 1
@@ -205,7 +205,7 @@ class Plant:
         fade = np.repeat([f, math.sqrt(f)], [self.K, core.DRAWS])[:, None]  # unit noise is drawn for faded samples
         self.before, self.G, self.r = f * self.before, f * self.G + Z.T @ Z, fade * self.r + told @ Z
         self.ee, self.count = f * self.ee + energy, f * self.count + samples
-        self.explained = f * self.explained + samples * np.sum(d**2) / self.B
+        self.explained = f * self.explained + np.sum(d**2)
 
     def fit(self):
         """Take some steps towards (G + q P) theta = r + q P mean, and estimate q; return False if nothing can be told."""
@@ -237,7 +237,8 @@ class Plant:
         theta = self.theta[:K]
         residual = np.maximum(self.ee + np.sum(theta * (theta @ self.G - 2 * self.r[:K]), axis=1), 0.0)
         # The noise, with the earlier estimate counting as n samples: a short record leaves little noise by chance.
-        self.q = np.maximum((residual + self.n * self.q) / (self.count + self.n), 1e-6 * self.ee / self.count)
+        counted = max(self.count - split / 2, 0.0) + self.n
+        self.q = np.maximum((residual + self.n * self.q) / counted, 1e-6 * self.ee / self.count)
         self.theta[K:] *= min(math.sqrt(q / np.mean(self.q)), 1.0)  # if q rises, draws keep their size
         # By chance alone, n taps explain n q. James and Stein: what is not significant is not played.
         explained = np.sum(theta[:, :split] @ self.G[:split, :split] * theta[:, :split])
