@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.signal import butter, lfilter
 
 from kfopc_filterpy import Plant, kf_pb, noise_reduction_db, output_power, simulate
@@ -126,6 +127,28 @@ def test_a_path_whose_polarity_flips_raises_an_alarm_and_is_learnt_again(averagi
     assert misalignment_db(controller.identified_path, -S) < -10.0
     last = slice(-round(3 * FS), None)
     assert noise_reduction_db(result.error[last], result.disturbance[last], steady=1.0) > 3.0
+
+
+def test_a_drift_of_the_primary_path_is_none_of_the_secondary_one() -> None:
+    """A fifth of a sample a second, which the filter follows. If s were learnt anew after the alarm, s^ would be lost."""
+    x = noise(10.0)
+    d, t = np.convolve(x, PRIMARY)[: x.size], np.arange(x.size)
+    d = CubicSpline(t, d)(t - 0.2 * np.maximum(t / FS - 3.0, 0.0)) + 0.01 * noise(10.0, 1)
+    controller = made()
+    result = simulate(controller, x, Plant(S, fs=FS), disturbance=d)
+    assert controller.alarms == 1
+    assert misalignment_db(controller.identified_path, S) < -25.0
+    last = slice(-round(2 * FS), None)
+    assert noise_reduction_db(result.error[last], d[last], steady=1.0) > 2.0
+
+
+def test_a_later_secondary_path_is_learnt_when_a_second_surprise_contradicts_that_it_is_the_same() -> None:
+    controller = made()
+    run(controller, noise(6.0))
+    later = np.roll(S, 1)
+    run(controller, noise(6.0, 1), later)
+    assert controller.alarms == 2
+    assert misalignment_db(controller.identified_path, later) < -10.0
 
 
 def test_the_account_has_a_hard_end() -> None:
