@@ -142,6 +142,20 @@ def test_a_drift_of_the_primary_path_is_none_of_the_secondary_one() -> None:
     assert noise_reduction_db(result.error[last], d[last], steady=1.0) > 2.0
 
 
+def test_silence_after_a_surprise_teaches_nothing() -> None:
+    """The loudspeaker stays silent until something has been heard of the new path."""
+    controller, x = made(), noise(1.0, 1)
+    run(controller, noise(188 * BLOCK / FS))
+    d, y, n = np.convolve(x, PRIMARY), np.zeros(x.size + M), 0
+    while not controller.alarms:
+        y[n + M] = controller.control_signal(x[n])
+        controller.update(d[n] + S @ y[n + M : n : -1])  # the polarity has changed
+        n += 1
+    for reference in np.r_[np.zeros(3 * BLOCK), x[:BLOCK]]:
+        assert controller.control_signal(reference) == 0.0
+        controller.update(0.0)
+
+
 def test_a_later_secondary_path_is_learnt_when_a_second_surprise_contradicts_that_it_is_the_same() -> None:
     controller = made()
     run(controller, noise(6.0))
