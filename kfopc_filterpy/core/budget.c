@@ -78,8 +78,9 @@ static int takes(const anc_plan *p, real block, real averaging)
     const double K = p->microphones, J = p->loudspeakers, I = p->references;
     const double L = p->taps, M = p->path_taps, N = L + M - 1, spectrum = 4 * N + 2;
     if (p->guard_taps || p->scenarios != 1) return 0;
-    if (!(B >= 1 && B <= 65536 && T >= BLOCK_LASTS && T <= 100000 && N <= 1 << 20)) return 0;
-    return (K + DRAWS) * (I + J) * N <= most && J * T <= most &&
+    if (!(B >= 1 && B <= 65536 && T >= (double)BLOCK_LASTS && T <= 100000 && N <= 1 << 20))
+        return 0;
+    return (K + (double)DRAWS) * (I + J) * N <= most && J * T <= most &&
            (I + J + K) * (2 * N + B) <= most && (I + J + 1) * (I + J) * spectrum <= most &&
            J * I * J * I * spectrum <= most && 4 * J * I * L <= most;
 }

@@ -86,7 +86,9 @@ def test_other_processors(real: str, processor: str, tmp_path: Path) -> None:
     """A static program of zig, run by an emulator."""
     emulator = tool({"x86": "qemu-i386"}.get(processor, f"qemu-{processor}"))
     target = {"arm": "arm-linux-musleabihf"}.get(processor, f"{processor}-linux-musl")
-    made = program("same_bits", tmp_path, zig(), "-static", real=real, target=target)
+    # The vectors of 32-bit ARM take numbers below 1e-38 for zero, other than its scalars and all other processors.
+    options = ["-mcpu=baseline-neon"] if processor == "arm" else []
+    made = program("same_bits", tmp_path, zig(), "-static", *options, real=real, target=target)
     assert_same(ran(emulator, made), real, tmp_path)
 
 
