@@ -184,7 +184,7 @@ static void multiply_data(posterior *f, real *to, const real *t, real q)
         transform_back(F, sums, out + (size_t)c * each, n);
         for (int32_t i = 0; i < n; i++)
             sums[i] += ridge * f->taper[i] * f->taper[i] * t[times(c, N) + (size_t)i];
-        clear(sums + n, (size_t)(N - n));
+        for (int32_t i = n; i < N; i++) sums[i] = 0;
     }
 }
 
