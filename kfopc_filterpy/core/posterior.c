@@ -81,6 +81,14 @@ static real sign_of(int32_t *random)
     return next >> 31 ? 1 : -1;
 }
 
+/* Expect the secondary paths to be what is believed of them. */
+static void expect_learned(posterior *f)
+{
+    for (int32_t k = 0; k < f->K; k++)
+        for (int32_t c = f->I; c < f->C; c++)
+            copy(taps_of(f, f->prior, k, c), taps_of(f, f->theta, k, c), (size_t)f->M);
+}
+
 void start_posterior(posterior *f, real spread)
 {
     f->numbers->spread = spread;
@@ -89,8 +97,8 @@ void start_posterior(posterior *f, real spread)
     start_fourier(&f->fourier);
     for (int32_t k = 0; k < f->K; k++)
         for (int32_t c = f->I; c < f->C; c++)
-            copy(taps_of(f, f->prior, k, c), given_path(f, k, c), (size_t)f->M);
-    copy(f->theta, f->prior, times(f->K * f->C, f->N));
+            copy(taps_of(f, f->theta, k, c), given_path(f, k, c), (size_t)f->M);
+    expect_learned(f);
     for (int32_t row = f->K; row < f->rows; row++)
         for (int32_t c = 0; c < f->C; c++)
             for (int32_t i = 0; i < f->N; i++) {
@@ -533,9 +541,7 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     f->counts[SILENT] = is->heard / (real)f->B >= is->expected / count;
     /* If it does good, s is as before, unless that was wrong at the last surprise. */
     known->spread = f->counts[SILENT] || known->spread <= HELD ? REDRAWN : HELD;
-    for (int32_t k = 0; k < f->K; k++)
-        for (int32_t c = f->I; c < f->C; c++)
-            copy(taps_of(f, f->prior, k, c), taps_of(f, f->theta, k, c), (size_t)f->M);
+    expect_learned(f);
     begin_data(f, 0);
     return 0;
 }
