@@ -153,8 +153,7 @@ class EventRow:
 def event(name: str) -> Event:
     """Return a run of the plant of the README."""
     what, at_s, own = EVENTS[name]
-    change = CHANGES[what]
-    settings: dict[str, Any] = {"fs": FS, "rated_power": RATED} | own
+    change, settings = CHANGES[what], {"fs": FS, "rated_power": RATED} | own
     fs = settings["fs"]
     at, end = round(at_s * fs), round((at_s + change.lasting_s) * fs)
     n = end + round(AFTER_S * fs)
