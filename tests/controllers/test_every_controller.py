@@ -16,13 +16,13 @@ import pytest
 from helpers.channels import random_paths
 from helpers.checkpoints import Room
 from helpers.comparing import assert_same_run
-from helpers.controllers import ALL, IN_BLOCKS, PATHS, I, J, K
-from helpers.loop import AMPLIFIERS, FEEDBACK, FS, S, noises
+from helpers.controllers import ALL, IN_BLOCKS, KALMAN, PATHS, I, J, K
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, N_TAPS, S_HAT, S, noises
 from helpers.simulation import Stepwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy import HardClipAmplifier, Plant, simulate
+from kfopc_filterpy import HardClipAmplifier, Plant, kf_opc, simulate
 from kfopc_filterpy.checkpoint import content_of
 from kfopc_filterpy.controllers import RefusedUpdate
 from kfopc_filterpy.controllers.frequency_domain import FrequencyDomainController
@@ -294,6 +294,16 @@ def test_listening_to_a_bad_sample_changes_nothing(name: str, bad: str) -> None:
     with pytest.raises(ValueError, match=r"loud|finite|overflow|at most"):
         controller.listen(*((x, spoilt) if bad == "error" else (spoilt, e)))
     assert content_of(controller) == before
+
+
+def test_a_pause_while_listening_teaches_the_constraint_nothing() -> None:
+    controller = kf_opc(N_TAPS, S_HAT, rated_power=0.1, fs=FS, **KALMAN)
+    x, e = Room(controller).heard(slice(200))
+    controller.listen(x, e)
+    before = [array.tobytes() for array in controller.constraint.state]
+    assert 0.0 < controller.constraint_factor < 1.0
+    controller.listen(100.0 * x, 200.0 * e, adapt=False)
+    assert [array.tobytes() for array in controller.constraint.state] == before
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if name not in ("LimitedController", *PYTHONS)])

@@ -12,6 +12,7 @@ from kfopc_filterpy import (
     KalmanController,
     OutputPowerConstraint,
     Plant,
+    fx_lms,
     kf_anc,
     kf_opc,
     kf_pb,
@@ -19,7 +20,7 @@ from kfopc_filterpy import (
     noise_reduction_db,
     simulate,
 )
-from kfopc_filterpy.paths import PathTolerance
+from kfopc_filterpy.paths import PathTolerance, guard_filter
 from kfopc_filterpy.signals import tone
 
 FS = 8000.0
@@ -48,6 +49,24 @@ def test_a_tone_at_which_the_path_is_reversed_is_left_alone(name: str) -> None:
         changes.append(np.inf if diverged else -noise_reduction_db(result.error, result.disturbance))
     assert changes[0] > 3.0
     assert changes[1] < 0.3
+
+
+def test_an_uncertainty_that_comes_later_guards_what_was_heard_before() -> None:
+    """After any number of samples; with the longest guard, for a filter as long, so that every stored sample counts."""
+    guard = guard_filter(TOLERANCE, TRUE)
+    assert guard is not None
+    assert guard.size == 48
+    assert abs(guard[-2]) > 1e-6  # the last one is 0
+    x, d = np.random.default_rng(1).standard_normal((2, 400))
+    for n in range(200, 350):  # more than a delay line is long
+        one, other = (fx_lms(48, TRUE, step_size=1e-3) for _ in range(2))
+        other.secondary_path_uncertainty = TOLERANCE
+        for controller in (one, other):
+            controller.listen(x[:n], d[:n])
+        one.secondary_path_uncertainty = TOLERANCE
+        emitted, expected = (controller.process(x[n : n + 20], d[n : n + 20]) for controller in (one, other))
+        assert np.abs(expected).max() > 0.01
+        np.testing.assert_allclose(emitted, expected, rtol=0, atol=1e-12)  # rounding of two orders of the same sums
 
 
 def test_what_takes_no_uncertainty_says_what_does() -> None:

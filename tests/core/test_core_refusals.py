@@ -126,6 +126,12 @@ def test_the_largest_shape_is_taken_and_no_larger_or_empty_one(shape: dict[str, 
             assert bool(Algorithm("fxlms").shapes(Shape(**plain | {name: value}))) == (least <= number <= most)
 
 
+def test_a_block_with_more_errors_than_an_int32_counts_is_refused() -> None:
+    settings = {**ALGORITHMS["power_budget"], "block": 65_536.0}
+    with pytest.raises(ValueError, match="a controller of this size cannot be made"):
+        Block(Algorithm("power_budget"), Shape(5000, 1, 1, 1, 1), path=np.ones(5000), settings=settings)
+
+
 def test_settings_are_in_the_order_of_the_c_file() -> None:
     for name in known():
         assert [one.name for one in Algorithm(name).settings] == list(ALGORITHMS[name])

@@ -82,6 +82,7 @@ TESTS = {  # which, as pytest's -k says it, and of which files
         "tests/controllers/test_internal_model.py",
         "tests/controllers/test_new_secondary_path.py",
         "tests/controllers/test_uncertain_path.py",
+        "tests/controllers/test_kalman_variants.py",
         *LOOP,
         *CONTROLLERS,
         "tests/core/test_core_refusals.py",
