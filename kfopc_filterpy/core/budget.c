@@ -26,9 +26,10 @@ static const anc_setting budget_settings[] = {{"rated_power", 1e-30f, 0, ANC_EAC
 static const real PLANNED = (real)1.02, MOST = (real)1.04;
 /* A noise may go on as in the window of x for this part of the averaging time, and as in the last
  * block for this one. */
-enum { WINDOW_LASTS = 4, BLOCK_LASTS = 20 };
-/* The level of x is that of an exponential window which is so much shorter than that of its
- * spectrum: a spectrum needs many samples, a level few. */
+enum { WINDOW_LASTS = 5, BLOCK_LASTS = 20 };
+/* Windows of levels. NOW is so much shorter than USUAL, which is that of R. RECENT is the same
+ * without pauses, and LATE the averaging time without pauses. */
+enum { NOW, USUAL, RECENT, LATE, LEVELS };
 enum { SHORTER = 5 };
 /* A sound does not grow by more than this from one sample to the next, but a click does. */
 static const real GROWTH = 10;
@@ -49,20 +50,20 @@ typedef struct {
     real *asked;              /* (3, J) now; sum of squares of the block; the most it may become */
     real *peak;               /* (I + K) largest magnitudes of x and e of late */
     int32_t *controlled;      /* whether control was on in the block */
-    real *R, *short_R;        /* (I, I, N) windowed sums of x_i(t) x_a(t - l) */
-    real *weight;             /* (2) of these windows */
+    real *R;                  /* (I, I, N) windowed sums of x_i(t) x_a(t - l) */
+    real *levels, *weight;    /* (LEVELS) windowed sums of mean squares of x in blocks; (LEVELS) */
+    int32_t *pause;           /* blocks so far */
     real *book;               /* (T, J) power of each block over the rating, newest first */
     real *price;              /* (J) */
     real *now;                /* (J, I, L) filters at these prices */
-    real *lags;               /* (I, I, N) of the windows, into which the newest block fades in */
+    real *lags;               /* (I, I, N) of the window, into which the newest block fades in */
     real *R_at, *smooth_R;    /* (I, I) spectra: of the lags, of a circulant near to them */
-    real *short_at;           /* (I, I) spectra: of the short window */
     real *SS, *gain;          /* (J, J) spectra of the secondary paths; (J) mean of the diagonal */
     real *smooth_A, *factor;  /* (J, I, J, I) spectra: of the filtered references, and priced */
     real *b;                  /* (J, I, L) */
     real *spectra, *products; /* (J, I), (J, I) spectra */
     real *vectors;            /* (4, J, I, L) */
-    real *small;              /* (4, J) slopes, levels, powers, and what is afforded */
+    real *small;              /* (3, J) slopes, powers, and what is afforded */
     real *window;             /* (I, B + N - 1) */
     real *work;               /* of a path, (N), or of a block, (B) */
 } budget;
@@ -105,15 +106,15 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     f->peak = reals(at, "peaks", ANC_STATE, 1, 1, 1, I + s->K);
     f->controlled = int32s(at, "controlled", ANC_STATE, 1);
     f->R = reals(at, "reference_correlation", ANC_STATE, 1, I, I, N);
-    f->short_R = reals(at, "short_correlation", ANC_STATE, 1, I, I, N);
-    f->weight = reals(at, "window_weights", ANC_STATE, 1, 1, 1, 2);
+    f->levels = reals(at, "levels", ANC_STATE, 1, 1, 1, LEVELS);
+    f->weight = reals(at, "level_weights", ANC_STATE, 1, 1, 1, LEVELS);
+    f->pause = int32s(at, "pause", ANC_STATE, 1);
     f->book = reals(at, "book", ANC_STATE, 1, 1, f->T, J);
     f->price = reals(at, "price", ANC_STATE, 1, 1, 1, J);
     f->now = reals(at, "filters", ANC_STATE, 1, J, I, L);
     f->lags = reals(at, "lags", ANC_SCRATCH, 1, I, I, N);
     f->R_at = reals(at, "reference_spectra", ANC_SCRATCH, 1, I, I, spectrum);
     f->smooth_R = reals(at, "smooth_reference_spectra", ANC_SCRATCH, 1, I, I, spectrum);
-    f->short_at = reals(at, "short_spectra", ANC_SCRATCH, 1, I, I, spectrum);
     f->SS = reals(at, "path_spectra", ANC_SCRATCH, 1, J, J, spectrum);
     f->gain = reals(at, "path_gains", ANC_SCRATCH, 1, 1, 1, J);
     f->smooth_A = reals(at, "smooth_spectra", ANC_SCRATCH, J * I, J, I, spectrum);
@@ -122,7 +123,7 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     f->spectra = reals(at, "filter_spectra", ANC_SCRATCH, 1, J, I, spectrum);
     f->products = reals(at, "filter_products", ANC_SCRATCH, 1, J, I, spectrum);
     f->vectors = reals(at, "filter_vectors", ANC_SCRATCH, 4, J, I, L);
-    f->small = reals(at, "of_loudspeakers", ANC_SCRATCH, 1, 1, 4, J);
+    f->small = reals(at, "of_loudspeakers", ANC_SCRATCH, 1, 1, 3, J);
     f->window = reals(at, "windowed", ANC_SCRATCH, 1, 1, I, B + N - 1);
     f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, 1, B > N ? B : N);
 }
@@ -149,55 +150,78 @@ static void start_budget(anc_view *view)
 
 /* The references. */
 
-/* Return the factor of the short window, a sample. */
-static real short_window(const budget *f) { return raised(*f->s.setting[WINDOW], SHORTER); }
+/* Take the block into the levels. After a soft time, a level is that of the loud block at once. A
+ * block that is much softer than the recent level is a pause, if there are no more than T of them.
+ */
+static void take_levels(budget *f)
+{
+    const int32_t B = f->posterior.B;
+    const real g = raised(*f->s.setting[WINDOW], B);
+    const real fade[LEVELS] = {raised(g, SHORTER), g, g, 1 - 1 / (real)f->T};
+    real block = 0;
+    for (int32_t i = 0; i < f->s.I; i++) {
+        const real *x = history_of(&f->posterior, i);
+        block += dot(x, x, B) / (real)B;
+    }
+    const int soft = LOUDER * LOUDER * block * f->weight[RECENT] < f->levels[RECENT];
+    const int stays_soft = soft && *f->pause >= f->T;
+    *f->pause = soft && *f->pause < f->T ? *f->pause + 1 : 0;
+    for (int w = 0; w < LEVELS; w++) {
+        real *sum = f->levels + w, *weight = f->weight + w;
+        if (w > USUAL && *f->pause) continue;
+        if (block * *weight > LOUDER * *sum || (w > USUAL && stays_soft)) {
+            *weight = 1;
+            *sum = block;
+        }
+        *sum = faded(*sum, fade[w], block);
+        *weight = fade[w] * *weight + 1;
+    }
+}
 
-/* Add the lags of the block, which fades by `slow` a sample, to sums, (I, I, N); it may fade in,
- * too. Return the sum of its squared weights. */
-static real add_block(budget *f, real *sums, real slow, int fades_in)
+static real level_of(const budget *f, int w) { return f->levels[w] / f->weight[w]; }
+
+/* Return a level over another one, 1 in silence. */
+static real levels_over(const budget *f, int a, int b)
+{
+    return f->levels[b] > 0 ? level_of(f, a) / level_of(f, b) : 1;
+}
+
+/* Add the lags of the block, which fades by `slow` a sample, to sums, (I, I, N); it may fade in. */
+static void add_block(budget *f, real *sums, real slow, int fades_in)
 {
     const int32_t I = f->s.I, N = f->posterior.N, B = f->posterior.B, length = B + N - 1;
-    real all = 0, share = 1;
+    real share = 1;
     for (int32_t t = 0; t < length; t++, share *= slow) {
         const real from_begin = ((real)(B - t) - (real)0.5) / (real)B;
         const real fade_in = fades_in && t < B ? 1 - from_begin * from_begin : 1;
-        const real weight = share * fade_in;
         for (int32_t i = 0; i < I; i++)
-            f->window[times(i, length) + (size_t)t] = weight * history_of(&f->posterior, i)[t];
-        if (t < B) all += weight * weight;
+            f->window[times(i, length) + (size_t)t] =
+                share * fade_in * history_of(&f->posterior, i)[t];
     }
     for (int32_t i = 0; i < I; i++)
         for (int32_t a = 0; a < I; a++)
             add_lags(&f->posterior.fourier, sums + times(i * I + a, N),
                      f->window + times(i, length), B, f->window + times(a, length), N);
-    return all;
 }
 
-/* Add the block to a window of the references, (I, I, N), and to its weight. Set the lags to those
- * of a window into which the newest block fades in: without its edge, on which a filter would ring.
- * Both are lags of one faded signal, hence positive definite. */
-static void take_references(budget *f, real *sums, real *weight, real g)
+/* Add the block to the window of the references. Set the lags to those of a window into which the
+ * newest block fades in: without its edge, on which a filter would ring. Both are lags of one faded
+ * signal, hence positive definite. Their mean square is the usual level. */
+static void take_references(budget *f)
 {
-    const int32_t I = f->s.I, N = f->posterior.N, B = f->posterior.B;
-    const real fade = raised(g, B), slow = root(g);
-    real loud = 0, usual = 0;
-    for (int32_t i = 0; i < I; i++) {
-        const real *x = history_of(&f->posterior, i);
-        loud += dot(x, x, B) / (real)B;
-        usual += sums[times(i * I + i, N)];
-    }
-    /* After a soft time, the mean is that of the loud block at once: the soft samples count less.
-     */
-    if (loud * *weight > LOUDER * usual) *weight = usual / loud;
-    for (size_t n = 0; n < times(I * I, N); n++) f->lags[n] = sums[n] = faded(sums[n], fade, 0);
-    const real soft = fade * *weight + add_block(f, f->lags, slow, 1);
-    for (size_t n = 0; n < times(I * I, N); n++) f->lags[n] /= soft;
-    *weight = fade * *weight + add_block(f, sums, slow, 0);
+    const int32_t I = f->s.I, N = f->posterior.N;
+    const real g = *f->s.setting[WINDOW], fade = raised(g, f->posterior.B), slow = root(g);
+    for (size_t n = 0; n < times(I * I, N); n++) f->lags[n] = f->R[n] = faded(f->R[n], fade, 0);
+    add_block(f, f->lags, slow, 1);
+    add_block(f, f->R, slow, 0);
+    real sum = 0;
+    for (int32_t i = 0; i < I; i++) sum += f->lags[times(i * I + i, N)];
+    const real scale = sum > 0 ? level_of(f, USUAL) / sum : 0;
+    for (size_t n = 0; n < times(I * I, N); n++) f->lags[n] *= scale;
 }
 
-/* Set the spectra of the lags; their mean square becomes `more` times as large, as if there were
- * white noise. */
-static void transform_references(budget *f, real *spectra, real more, int32_t n, int smooth)
+/* Set the spectra of n lags, with some white noise. */
+static void transform_references(budget *f, real *spectra, int32_t n, int smooth)
 {
     const int32_t I = f->s.I, N = f->posterior.N;
     const fourier *F = &f->posterior.fourier;
@@ -207,7 +231,7 @@ static void transform_references(budget *f, real *spectra, real more, int32_t n,
                        *behind = f->lags + times(i * I + a, N);
             real *spectrum = spectra + times(i * I + a, F->F);
             transform_lags(F, spectrum, ahead, behind, n, smooth);
-            for (int32_t k = 0; i == a && k < F->half; k++) spectrum[k] += more * ahead[0];
+            for (int32_t k = 0; i == a && k < F->half; k++) spectrum[k] += REGULAR * ahead[0];
         }
 }
 
@@ -266,21 +290,6 @@ static void set_equations(budget *f)
             for (int32_t l = 1; l < L; l++) behind[l] = -lags[F->F - l]; /* it is skew */
             transform_lags(F, f->smooth_A + times(ji * J * I + ac, F->F), lags, behind, L, 1);
         }
-}
-
-/* Return the power of loudspeaker j with the filters v; R v is left in `to`, (I, L). */
-static real power_of(budget *f, const real *R, const real *v, int32_t j, real *to)
-{
-    const int32_t I = f->s.I, L = f->s.L;
-    const fourier *F = &f->posterior.fourier;
-    const real *own = v + times(j, I * L);
-    real *sums = scratch_row(F, 2);
-    for (int32_t i = 0; i < I; i++) transform(F, f->spectra + times(i, F->F), own + times(i, L), L);
-    for (int32_t i = 0; i < I; i++) {
-        multiply_row(F, sums, R + times(i * I, F->F), f->spectra, I);
-        transform_back(F, to + times(i, L), sums, L);
-    }
-    return dot(to, own, I * L);
 }
 
 /* Set to = (A + price R) v for all filters. */
@@ -342,8 +351,20 @@ static void solve_filters(budget *f)
 /* Set the powers of the filters; u_j = R v_j are left in the vectors. */
 static void set_powers(budget *f, real *power)
 {
-    for (int32_t j = 0; j < f->s.J; j++)
-        power[j] = power_of(f, f->R_at, f->now, j, f->vectors + times(j, f->s.I * f->s.L));
+    const int32_t I = f->s.I, L = f->s.L;
+    const fourier *F = &f->posterior.fourier;
+    real *sums = scratch_row(F, 2);
+    for (int32_t j = 0; j < f->s.J; j++) {
+        const real *own = f->now + times(j, I * L);
+        real *u = f->vectors + times(j, I * L);
+        for (int32_t i = 0; i < I; i++)
+            transform(F, f->spectra + times(i, F->F), own + times(i, L), L);
+        for (int32_t i = 0; i < I; i++) {
+            multiply_row(F, sums, f->R_at + times(i * I, F->F), f->spectra, I);
+            transform_back(F, u + times(i, L), sums, L);
+        }
+        power[j] = dot(u, own, I * L);
+    }
 }
 
 /* Set the sums over a of |u_j'A^-1 u_a|, with the preconditioner in place of A. */
@@ -398,52 +419,45 @@ static real power_of_block(const budget *f, const real *v)
 
 /* Return the power that loudspeaker j's account can afford, if the noise goes on: as in the last
  * block, where its filter has another power, for a short time; as in the window of x, for longer;
- * and then at the level of now. So what a silence has saved is spent evenly. */
-static real affordable(const budget *f, int32_t j, real power, real level)
+ * and then at the lower one of the levels of now, over the usual one, and of late, over the recent
+ * one. So what a silence has saved is spent evenly, and the price hardly follows a noise that
+ * fluctuates. */
+static real affordable(const budget *f, int32_t j, real power)
 {
     const int32_t T = f->T, block = T / BLOCK_LASTS, window = T / WINDOW_LASTS;
     const real of_block = power_of_block(f, f->now + times(j, f->s.I * f->s.L));
+    const real in_block = of_block > 0 && power > 0 ? of_block / power : 1;
+    const real later = smaller(levels_over(f, NOW, USUAL), levels_over(f, LATE, RECENT));
     real spent = 0, least = 0;
     for (int32_t n = T - 1; n >= block; n--) { /* spent, and still counted n blocks from now */
         spent += f->book[times(T - 1 - n, f->s.J) + (size_t)j];
         const int longer = n > window && n <= T - block;
-        if (!longer && n != window && (n != block || !(of_block > 0 && power > 0))) continue;
+        if (!longer && n != window && n != block) continue;
         const real left = (longer ? 1 : PLANNED) * (real)T - spent;
-        const real each = larger(left / (real)n, PLANNED - 1) * f->s.setting[RATED_POWER][j];
-        const real afforded = each * (longer ? 1 / level : n == window ? 1 : power / of_block);
-        if (least == 0 || afforded < least) least = afforded;
+        const real level = longer ? later : n == window ? 1 : in_block;
+        const real each = larger(left / (real)n, PLANNED - 1) / level;
+        if (least == 0 || each < least) least = each;
     }
-    return least;
-}
-
-/* Set the levels of x, of now over the usual ones, as the last filters tell them; at most 1. */
-static void set_levels(budget *f, real *level)
-{
-    for (int32_t j = 0; j < f->s.J; j++) {
-        const real usual = power_of(f, f->R_at, f->s.weights, j, f->vectors);
-        const real now = power_of(f, f->short_at, f->s.weights, j, f->vectors);
-        level[j] = usual > 0 && now > 0 ? smaller(now / usual, 1) : 1;
-    }
+    return least * f->s.setting[RATED_POWER][j];
 }
 
 /* Set the filters of least expected error at the prices, their powers, and those that the accounts
  * afford. */
-static void solve_at_prices(budget *f, const real *level, real *power, real *afforded)
+static void solve_at_prices(budget *f, real *power, real *afforded)
 {
     solve_filters(f);
     set_powers(f, power);
-    for (int32_t j = 0; j < f->s.J; j++) afforded[j] = affordable(f, j, power[j], level[j]);
+    for (int32_t j = 0; j < f->s.J; j++) afforded[j] = affordable(f, j, power[j]);
 }
 
 /* Set the prices at which the accounts afford the filters. What a step leaves is taken off. */
 static void solve_all(budget *f)
 {
     const int32_t J = f->s.J, n = f->s.I * f->s.L;
-    real *level = f->small + J, *power = level + J, *afforded = power + J;
+    real *power = f->small + J, *afforded = power + J;
     set_equations(f);
-    set_levels(f, level);
-    solve_at_prices(f, level, power, afforded);
-    if (next_prices(f, power, afforded)) solve_at_prices(f, level, power, afforded);
+    solve_at_prices(f, power, afforded);
+    if (next_prices(f, power, afforded)) solve_at_prices(f, power, afforded);
     for (int32_t j = 0; j < J; j++) {
         const real share = power[j] > afforded[j] ? root(afforded[j] / power[j]) : 1;
         for (int32_t i = 0; i < n; i++)
@@ -465,11 +479,10 @@ static int is_too_loud(const signals *s, const real *reference)
 static void end_block(budget *f)
 {
     const int32_t J = f->s.J, B = f->posterior.B;
-    take_references(f, f->short_R, f->weight + 1, short_window(f));
-    transform_references(f, f->short_at, 0, f->posterior.N, 0);
-    take_references(f, f->R, f->weight, *f->s.setting[WINDOW]);
-    transform_references(f, f->R_at, REGULAR, f->posterior.N, 0);
-    transform_references(f, f->smooth_R, REGULAR, f->s.L, 1);
+    take_levels(f);
+    take_references(f);
+    transform_references(f, f->R_at, f->posterior.N, 0);
+    transform_references(f, f->smooth_R, f->s.L, 1);
     if (*f->controlled) {
         memmove(f->book + J, f->book, sizeof(real) * times(f->T - 1, J));
         for (int32_t j = 0; j < J; j++)

@@ -167,6 +167,15 @@ def test_a_reference_that_sets_in_after_silence() -> None:
     assert np.mean(oracle.book) > 0.5
 
 
+@pytest.mark.parametrize("levels", [(1.0, 0.1, 1.0, 0.1), (1.0, 3.0, 6.0, 0.3)])
+def test_a_noise_whose_level_changes(levels: tuple[float, ...]) -> None:
+    """With pauses, some of which last longer than the account."""
+    s, x, d, rng = scene(7, 1, 1, 1, 12.0)
+    level = np.repeat(levels, x.shape[1] // len(levels))
+    x, d = level * x, level * d + 0.001 * rng.standard_normal(d.shape)
+    compare(*pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), 0.3), x, d, lambda n: s)
+
+
 def test_an_amplifier_model() -> None:
     """The posterior takes what was played."""
     s, x, d, _ = scene(6, 1, 1, 1, 6.0)

@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, lfilter
 
-from kfopc_filterpy import Plant, kf_pb, noise_reduction_db, output_power, simulate
+from kfopc_filterpy import Plant, kf_pb, noise_reduction_db, output_power, power_constrained_wiener, simulate
 from kfopc_filterpy.paths import PathTolerance, fir_path, misalignment_db
 from kfopc_filterpy.paths.uncertainty import rms_relative_error
 
@@ -163,6 +163,43 @@ def test_a_later_secondary_path_is_learnt_when_a_second_surprise_contradicts_tha
     run(controller, noise(6.0, 1), later)
     assert controller.alarms == 2
     assert misalignment_db(controller.identified_path, later) < -10.0
+
+
+@pytest.mark.parametrize("louder_db", [9.0, 10.0, 18.0])
+def test_what_a_softer_noise_has_saved_is_spent_evenly(louder_db: float) -> None:
+    """From half a second after the noise has become louder on, for more than the averaging time."""
+    x = noise(10.0)
+    x[: round(4 * FS)] *= 10 ** (-louder_db / 20)  # which takes less than the rated power
+    y = run(made(), x).control_signal
+    powers = np.mean(y[round(4.5 * FS) :].reshape(11, -1) ** 2, axis=1) / SETTINGS["rated_power"]
+    assert powers.min() > 0.85
+    assert powers.max() < 1.15
+
+
+def test_a_noise_that_stays_softer_is_no_pause() -> None:
+    """A crescendo, a noise that is far softer from then on, and a silence in it: what this saves is spent evenly."""
+    parts = ((1.0, 6.0), (2.0, 0.5), (4.0, 0.3), (0.03, 10.0), (0.0, 4.0), (0.03, 8.0))  # powers, seconds
+    level = np.concatenate([np.full(round(seconds * FS), power**0.5) for power, seconds in parts])
+    rated = 0.0075
+    plant = Plant(S, PRIMARY, fs=FS, sensor_noise_std=0.003)
+    y = simulate(made(rated_power=rated), level * noise(28.8), plant, rng=1).control_signal
+    after = y[round(20.8 * FS) :]
+    powers = np.mean(after.reshape(16, -1) ** 2, axis=1) / rated
+    assert powers[1:].min() > 0.85
+    assert powers.max() < 1.4
+
+
+def test_a_noise_that_comes_and_goes_has_nearly_one_price() -> None:
+    """Against the best fixed filter within the rated power, which has exactly one; with a price that follows it: 0.95 dB."""
+    x = noise(24.0)
+    x *= np.where(np.arange(x.size) % round(0.4 * FS) < round(0.2 * FS), 1.0, 0.25)
+    own = run(made(), x)
+    d, plant = own.disturbance, Plant(S, fs=FS)
+    rated = SETTINGS["rated_power"]
+    one = power_constrained_wiener(x, plant, n_taps=L, disturbance=d, rated_power=rated, segment_s=24.0).per_second
+    later = slice(round(4 * FS), None)
+    ours, best = (noise_reduction_db(error[later], d[later], steady=1.0) for error in (own.error, one.error))
+    assert best - ours < 0.6
 
 
 def test_the_account_has_a_hard_end() -> None:

@@ -258,26 +258,25 @@ class Plant:
         return self.significant * p, s[..., : self.M]
 
 
-class Window:
-    """An exponential window of the references: its lags, and those of one into which the newest block fades in."""
+class Level:
+    """The mean square of the references in a window of blocks."""
 
-    def __init__(self, references, n, g, block):
-        self.g, self.B, self.weight, self.sums = g, block, 0.0, np.zeros((references, references, n))
+    def __init__(self, fade):
+        self.fade, self.sum, self.weight = fade, 0.0, 0.0
 
-    def take(self, x):
-        """Take a block, with which x ends, and return the mean lags."""
-        n, f = self.sums.shape[2], self.g**self.B
-        loud, usual = np.sum(np.mean(x[:, -self.B :] ** 2, axis=1)), np.trace(self.sums[:, :, 0])
-        if loud * self.weight > core.LOUDER * usual:  # a soft past counts less
-            self.weight = usual / loud
-        fade_in = np.ones(x.shape[1])  # no edge at the window's end, on which a filter would ring
-        fade_in[-self.B :] = 1 - ((np.arange(self.B) + 0.5) / self.B) ** 2
-        w = self.g ** (np.arange(x.shape[1] - 1, -1, -1) / 2)
-        soft = f * self.sums + lags(x * w * fade_in, n)
-        soft = soft / (f * self.weight + np.sum((w * fade_in)[-self.B :] ** 2))
-        self.sums = f * self.sums + lags(x * w, n)
-        self.weight = f * self.weight + np.sum(w[-self.B :] ** 2)
-        return soft
+    def is_above(self, times, block):
+        """Return whether it is more than so many times the mean square of a block."""
+        return self.sum > times * block * self.weight
+
+    def take(self, block, *, anew=False):
+        """Take the mean square of a block; a soft past counts no more."""
+        if anew or block * self.weight > core.LOUDER * self.sum:
+            self.sum, self.weight = block, 1.0
+        self.sum, self.weight = self.fade * self.sum + block, self.fade * self.weight + 1
+
+    def over(self, other):
+        """Return it over another one, 1 in silence."""
+        return self.sum / self.weight / (other.sum / other.weight) if other.sum > 0 else 1.0
 
 
 @dataclass(kw_only=True)
@@ -295,12 +294,15 @@ class PowerBudget(Controller):
         self.N, self.B = L + M - 1, max(round(BLOCK_S * self.fs), 1)
         self.g = math.exp(-1 / (min(self.averaging_s / WINDOWS, WINDOW_S) * self.fs))  # of the window of x, a sample
         self.plant = Plant(self.s_hat, I, self.N, self.B, self.spread, math.exp(-self.B / (MEMORY_S * self.fs)))
-        self.window, self.short = (Window(I, self.N, g, self.B) for g in (self.g, self.g**core.SHORTER))
+        self.R_sums = np.zeros((I, I, self.N))  # lags of x in an exponential window
         self.x_past, self.y_past = np.zeros((I, self.N - 1 + self.B)), np.zeros((J, self.N - 1 + self.B))
         self.new, self.asked = [], []  # samples of this block: x, y, e; the squares asked for
         self.peak, self.e_peak = np.zeros(I), np.zeros(len(self.s_hat))  # of |x| and |e| of late
         self.heard = 0  # samples that the delay lines hold, as they were
         self.blocks = max(round(self.averaging_s * self.fs / self.B), core.BLOCK_LASTS)  # T, of the averaging time
+        self.current, self.usual = Level(self.g ** (core.SHORTER * self.B)), Level(self.g**self.B)
+        self.recent, self.late = Level(self.g**self.B), Level(1 - 1 / self.blocks)  # without pauses
+        self.pause = 0  # blocks so far
         self.book = np.ones((self.blocks, J))  # power of each block over the rating, newest first: all is spent
         self.set_room()
         self.price, self.now = np.zeros(J), np.zeros((J, I * L))  # filters at these prices
@@ -344,7 +346,7 @@ class PowerBudget(Controller):
         """Learn from a block: x (I, B), played y (J, B), e (K, B)."""
         self.x_past = np.concatenate([self.x_past, x], axis=1)[:, self.B :]
         self.y_past = np.concatenate([self.y_past, y], axis=1)[:, self.B :]
-        self.lags, self.short_lags = self.window.take(self.x_past), self.short.take(self.x_past)
+        self.take_references()
         if self.asked:
             spent = sum(self.asked) / (self.B * self.rated_power)
             self.book = np.concatenate([[spent], self.book[:-1]])
@@ -360,6 +362,24 @@ class PowerBudget(Controller):
         elif self.plant.fits and not self.plant.waiting:
             self.solve()
 
+    def take_references(self):
+        """Set the lags of the window, into which the newest block fades in, and how loud it was of late."""
+        block = np.sum(np.mean(self.x_past[:, -self.B :] ** 2, axis=1))
+        self.current.take(block), self.usual.take(block)
+        soft = self.recent.is_above(core.LOUDER**2, block)
+        self.pause = self.pause + 1 if soft else 0
+        stays_soft = self.pause > self.blocks  # no pause is longer than the account
+        if stays_soft or not soft:
+            self.pause = 0
+            self.recent.take(block, anew=stays_soft), self.late.take(block, anew=stays_soft)
+        self.later = min(self.current.over(self.usual), self.late.over(self.recent))
+        fade_in = np.ones(self.x_past.shape[1])  # no edge at the window's end, on which a filter would ring
+        fade_in[-self.B :] = 1 - ((np.arange(self.B) + 0.5) / self.B) ** 2
+        faded = self.x_past * self.g ** (np.arange(fade_in.size - 1, -1, -1) / 2)
+        past = self.g**self.B * self.R_sums
+        self.R_sums, self.lags = (past + lags(x, self.N) for x in (faded, faded * fade_in))
+        self.lags *= self.usual.sum / self.usual.weight / max(np.trace(self.lags[:, :, 0]), 1e-300)
+
     def set_room(self):
         """Set the sum of squares that each loudspeaker may play in the next block, whatever its filter asks for."""
         left = np.maximum(core.MOST * self.blocks - np.sum(self.book, axis=0), 0.0)
@@ -368,14 +388,11 @@ class PowerBudget(Controller):
     def solve(self):
         """Set the prices at which the accounts afford the filters of least expected error; what a step leaves is cut."""
         self.set_equations()
-        last = self.w.reshape(self.now.shape)
-        usual, now = power_of(last, self.R), power_of(last, toeplitz(two_sided(self.short_lags), self.w.shape[2]))
-        level = np.divide(now, usual, where=(usual > 0) & (now > 0), out=np.ones_like(now))
         self.now = self.solved(self.price, self.now)
-        last, self.price = self.price, self.next_price(self.price, self.now, self.afforded(np.minimum(level, 1.0)))
+        last, self.price = self.price, self.next_price(self.price, self.now, self.afforded())
         if np.any(self.price != last):
             self.now = self.solved(self.price, self.now)
-        share = self.afforded(np.minimum(level, 1.0)) / np.maximum(power_of(self.now, self.R), 1e-300)
+        share = self.afforded() / np.maximum(power_of(self.now, self.R), 1e-300)
         self.w = (self.now * np.sqrt(np.minimum(share, 1.0))[:, None]).reshape(self.w.shape)
 
     def set_equations(self):
@@ -410,23 +427,23 @@ class PowerBudget(Controller):
         price = np.maximum(price + step, 0.0)
         return np.where(price < 1e-9 * self.gain, 0.0, price)
 
-    def afforded(self, level):
+    def afforded(self):
         """Return the powers that the accounts afford, if the noise goes on.
 
-        As in the last block for T/20, as in the window of x for T/4, and at the level of now for any longer time: so what
-        a silence has left is spent evenly.
+        As in the last block for T/20; as in the window of x for T/5; and for any longer time at the lower one of the levels
+        of now and of late. So what a silence has left is spent evenly.
         """
         T, window, block = self.blocks, self.blocks // core.WINDOW_LASTS, self.blocks // core.BLOCK_LASTS
         spent = np.concatenate([np.zeros((1, len(self.now))), np.cumsum(self.book, axis=0)])
         X = regressors(self.x_past, self.w.shape[2])[-self.B :]
         power, of_block = power_of(self.now, self.R), np.mean((X @ self.now.T) ** 2, axis=0)
-        louder = np.divide(power, of_block, where=(of_block > 0) & (power > 0), out=np.full_like(power, np.inf))
+        in_block = np.divide(of_block, power, where=(of_block > 0) & (power > 0), out=np.ones_like(power))
 
         def each(n, planned):
             return np.maximum((planned * T - spent[T - n]) / n, core.PLANNED - 1) * self.rated_power
 
-        longer = [each(n, 1.0) / level for n in range(window + 1, T - block + 1)]
-        return np.min([each(window, core.PLANNED), each(block, core.PLANNED) * louder, *longer], axis=0)
+        longer = [each(n, 1.0) / self.later for n in range(window + 1, T - block + 1)]
+        return np.min([each(block, core.PLANNED) / in_block, each(window, core.PLANNED), *longer], axis=0)
 
 
 def power_of(v, R):
