@@ -27,8 +27,9 @@ static const real PLANNED = (real)1.02, MOST = (real)1.04;
 /* A noise may go on as in the window of x for this part of the averaging time, and as in the last
  * block for this one. */
 enum { WINDOW_LASTS = 5, BLOCK_LASTS = 20 };
-/* Windows of levels. NOW is so much shorter than USUAL, which is that of R. RECENT is the same
- * without pauses, and LATE the averaging time without pauses. */
+/* Windows of levels. USUAL is that of R, RECENT the same without pauses, and LATE the averaging
+ * time without pauses. NOW is so much shorter than that of R: a spectrum needs many samples, a
+ * level few. */
 enum { NOW, USUAL, RECENT, LATE, LEVELS };
 enum { SHORTER = 5 };
 /* A sound does not grow by more than this from one sample to the next, but a click does. */
@@ -52,7 +53,7 @@ typedef struct {
     int32_t *controlled;      /* whether control was on in the block */
     real *R;                  /* (I, I, N) windowed sums of x_i(t) x_a(t - l) */
     real *levels, *weight;    /* (LEVELS) windowed sums of mean squares of x in blocks; (LEVELS) */
-    int32_t *pause;           /* blocks so far */
+    int32_t *pause;           /* blocks of the present one so far */
     real *book;               /* (T, J) power of each block over the rating, newest first */
     real *price;              /* (J) */
     real *now;                /* (J, I, L) filters at these prices */
@@ -151,8 +152,7 @@ static void start_budget(anc_view *view)
 /* The references. */
 
 /* Take the block into the levels. After a soft time, a level is that of the loud block at once. A
- * block that is much softer than the recent level is a pause, if there are no more than T of them.
- */
+ * block that is LOUDER^2 times softer than the recent level is a pause, for at most T blocks. */
 static void take_levels(budget *f)
 {
     const int32_t B = f->posterior.B;
