@@ -198,10 +198,7 @@ static void add_block(budget *f, real *sums, real slow, int fades_in)
             f->window[times(i, length) + (size_t)t] =
                 share * fade_in * history_of(&f->posterior, i)[t];
     }
-    for (int32_t i = 0; i < I; i++)
-        for (int32_t a = 0; a < I; a++)
-            add_lags(&f->posterior.fourier, sums + times(i * I + a, N),
-                     f->window + times(i, length), B, f->window + times(a, length), N);
+    add_all_lags(&f->posterior.fourier, sums, f->window, f->window, I, length, B, N);
 }
 
 /* Add the block to the window of the references. Set the lags to those of a window into which the
@@ -225,14 +222,9 @@ static void transform_references(budget *f, real *spectra, int32_t n, int smooth
 {
     const int32_t I = f->s.I, N = f->posterior.N;
     const fourier *F = &f->posterior.fourier;
-    for (int32_t i = 0; i < I; i++)
-        for (int32_t a = 0; a < I; a++) {
-            const real *ahead = f->lags + times(a * I + i, N),
-                       *behind = f->lags + times(i * I + a, N);
-            real *spectrum = spectra + times(i * I + a, F->F);
-            transform_lags(F, spectrum, ahead, behind, n, smooth);
-            for (int32_t k = 0; i == a && k < F->half; k++) spectrum[k] += REGULAR * ahead[0];
-        }
+    transform_all_lags(F, spectra, f->lags, I, N, n, smooth);
+    for (int32_t ii = 0; ii < I * I; ii += I + 1)
+        add_white(F, spectra + times(ii, F->F), REGULAR * f->lags[times(ii, N)]);
 }
 
 /* The equations. */
@@ -273,19 +265,16 @@ static void set_equations(budget *f)
     const fourier *F = &f->posterior.fourier;
     real *sums = f->spectra, *lags = scratch_row(F, 3), *behind = scratch_row(F, 4);
     correlate_paths(f);
-    for (int32_t j = 0; j < J; j++)
-        for (int32_t i = 0; i < I; i++) {
-            multiply_row(F, sums, f->R_at + times(i * I, F->F), f->products + times(j * I, F->F),
-                         I);
-            transform_back(F, f->b + times(j * I + i, L), sums, L);
-        }
-    for (int32_t j = 0; j < J; j++)
+    for (int32_t j = 0; j < J; j++) {
+        multiply_rows(F, sums, f->R_at, f->products + times(j * I, F->F), I, I);
+        transform_rows_back(F, f->b + times(j * I, L), sums, I, L);
         transform_back(F, f->gain + j, f->SS + times(j * J + j, F->F), 1);
+    }
     for (int32_t ji = 0; ji < J * I; ji++)
         for (int32_t ac = 0; ac <= ji; ac++) {
             const int32_t j = ji / I, i = ji % I, a = ac / I, c = ac % I;
-            multiply_row(F, sums, f->SS + times(j * J + a, F->F), f->R_at + times(i * I + c, F->F),
-                         1);
+            multiply_rows(F, sums, f->SS + times(j * J + a, F->F), f->R_at + times(i * I + c, F->F),
+                          1, 1);
             transform_back(F, lags, sums, F->F);
             for (int32_t l = 1; l < L; l++) behind[l] = -lags[F->F - l]; /* it is skew */
             transform_lags(F, f->smooth_A + times(ji * J * I + ac, F->F), lags, behind, L, 1);
@@ -298,19 +287,16 @@ static void multiply_filters(void *self, real *to, const real *v)
     budget *f = self;
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
-    const size_t each = (size_t)F->F;
     real *sums = scratch_row(F, 2);
-    for (int32_t ac = 0; ac < J * I; ac++)
-        transform(F, f->spectra + (size_t)ac * each, v + times(ac, L), L);
+    transform_rows(F, f->spectra, v, J * I, L);
     for (int32_t a = 0; a < J; a++)
-        for (int32_t i = 0; i < I; i++)
-            multiply_row(F, f->products + times(a * I + i, F->F), f->R_at + times(i * I, F->F),
-                         f->spectra + times(a * I, F->F), I);
+        multiply_rows(F, f->products + times(a * I, F->F), f->R_at, f->spectra + times(a * I, F->F),
+                      I, I);
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++) {
             const real *own = f->products + times(j * I + i, F->F);
             const real price = f->price[j] + REGULAR * f->gain[j];
-            for (size_t k = 0; k < each; k++) sums[k] = price * own[k];
+            for (int32_t k = 0; k < F->F; k++) sums[k] = price * own[k];
             for (int32_t a = 0; a < J; a++)
                 add_product(F, sums, f->SS + times(j * J + a, F->F),
                             f->products + times(a * I + i, F->F), 1, 1);
@@ -353,16 +339,12 @@ static void set_powers(budget *f, real *power)
 {
     const int32_t I = f->s.I, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
-    real *sums = scratch_row(F, 2);
     for (int32_t j = 0; j < f->s.J; j++) {
         const real *own = f->now + times(j, I * L);
         real *u = f->vectors + times(j, I * L);
-        for (int32_t i = 0; i < I; i++)
-            transform(F, f->spectra + times(i, F->F), own + times(i, L), L);
-        for (int32_t i = 0; i < I; i++) {
-            multiply_row(F, sums, f->R_at + times(i * I, F->F), f->spectra, I);
-            transform_back(F, u + times(i, L), sums, L);
-        }
+        transform_rows(F, f->spectra, own, I, L);
+        multiply_rows(F, f->products, f->R_at, f->spectra, I, I);
+        transform_rows_back(F, u, f->products, I, L);
         power[j] = dot(u, own, I * L);
     }
 }
@@ -373,8 +355,7 @@ static void set_slopes(budget *f, real *slope)
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
     clear(slope, (size_t)J);
-    for (int32_t ji = 0; ji < J * I; ji++)
-        transform(F, f->products + times(ji, F->F), f->vectors + times(ji, L), L);
+    transform_rows(F, f->products, f->vectors, J * I, L);
     for (int32_t a = 0; a < J; a++) {
         clear(f->spectra, times(J * I, F->F));
         copy(f->spectra + times(a * I, F->F), f->products + times(a * I, F->F), times(I, F->F));

@@ -164,6 +164,18 @@ void transform_back(const fourier *f, real *to, const real *spectrum, int32_t n)
     for (int32_t k = 0; k < n - H; k++) to[H + k] = -Z[H + k] * d[k] - Z[k] * c[k];
 }
 
+void transform_rows(const fourier *f, real *spectra, const real *rows, int32_t n, int32_t taps)
+{
+    for (int32_t i = 0; i < n; i++)
+        transform(f, spectra + times(i, f->F), rows + times(i, taps), taps);
+}
+
+void transform_rows_back(const fourier *f, real *rows, const real *spectra, int32_t n, int32_t taps)
+{
+    for (int32_t i = 0; i < n; i++)
+        transform_back(f, rows + times(i, taps), spectra + times(i, f->F), taps);
+}
+
 void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *v, int32_t lags)
 {
     real *U = scratch_row(f, 2), *V = scratch_row(f, 3), *sums = scratch_row(f, 4);
@@ -179,6 +191,14 @@ void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *
         transform_back(f, U, sums, now);
         add_scaled(to + first, 1, U, now);
     }
+}
+
+void add_all_lags(const fourier *f, real *to, const real *u, const real *v, int32_t C, int32_t row,
+                  int32_t n, int32_t lags)
+{
+    for (int32_t a = 0; a < C; a++)
+        for (int32_t c = 0; c < C; c++)
+            add_lags(f, to + times(a * C + c, lags), u + times(a, row), n, v + times(c, row), lags);
 }
 
 void transform_lags(const fourier *f, real *spectrum, const real *ahead, const real *behind,
@@ -201,12 +221,23 @@ static void scale_spectrum(const fourier *f, real *restrict x, const real *restr
     for (int32_t k = 0; k < f->half; k++) x[f->half + k] *= by[k];
 }
 
-void multiply_row(const fourier *f, real *to, const real *row, const real *x, int32_t n)
+void transform_all_lags(const fourier *f, real *A, const real *lags, int32_t C, int32_t N,
+                        int32_t n, int smooth)
+{
+    for (int32_t a = 0; a < C; a++)
+        for (int32_t c = 0; c < C; c++)
+            transform_lags(f, A + times(a * C + c, f->F), lags + times(c * C + a, N),
+                           lags + times(a * C + c, N), n, smooth);
+}
+
+void multiply_rows(const fourier *f, real *to, const real *A, const real *x, int32_t rows,
+                   int32_t n)
 {
     const size_t each = (size_t)f->F;
-    clear(to, each);
-    for (int32_t c = 0; c < n; c++)
-        add_product(f, to, row + (size_t)c * each, x + (size_t)c * each, 1, 1);
+    clear(to, times(rows, f->F));
+    for (int32_t a = 0; a < rows; a++, to += each)
+        for (int32_t c = 0; c < n; c++, A += each)
+            add_product(f, to, A, x + (size_t)c * each, 1, 1);
 }
 
 void factorise_spectra(const fourier *f, real *A, int32_t n)
@@ -248,11 +279,9 @@ void solve_spectra(const fourier *f, const real *factor, real *x, int32_t n)
 void solve_circulants(const fourier *f, const real *factor, real *spectra, real *to, const real *r,
                       int32_t n, int32_t taps)
 {
-    for (int32_t i = 0; i < n; i++)
-        transform(f, spectra + times(i, f->F), r + times(i, taps), taps);
+    transform_rows(f, spectra, r, n, taps);
     solve_spectra(f, factor, spectra, n);
-    for (int32_t i = 0; i < n; i++)
-        transform_back(f, to + times(i, taps), spectra + times(i, f->F), taps);
+    transform_rows_back(f, to, spectra, n, taps);
 }
 
 void approach(const equations *of, const real *b, real *v, int steps)

@@ -25,8 +25,15 @@ void start_fourier(const fourier *f);
 void transform(const fourier *f, real *spectrum, const real *from, int32_t n);
 /* Set `to` to the first n of the F numbers of a spectrum; n <= F. */
 void transform_back(const fourier *f, real *to, const real *spectrum, int32_t n);
+/* The same for rows of taps and as many spectra. */
+void transform_rows(const fourier *f, real *spectra, const real *rows, int32_t n, int32_t taps);
+void transform_rows_back(const fourier *f, real *rows, const real *spectra, int32_t n,
+                         int32_t taps);
 /* Add sum_k u(k) v(k + l), k < n, to to_l, l < lags; v has n + lags - 1 numbers. */
 void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *v, int32_t lags);
+/* The same for all pairs of two times C rows of u and v: `to` is (C, C, lags). */
+void add_all_lags(const fourier *f, real *to, const real *u, const real *v, int32_t C, int32_t row,
+                  int32_t n, int32_t lags);
 /* Set a spectrum to that of ahead_l at lags l and behind_l at lags -l, l < n, under a triangle that
  * ends at lag n if `smooth`: then a definite Toeplitz matrix gives a definite circulant near to it,
  * as that of T. Chan, SIAM J. Sci. Stat. Comput. 9 (1988) 766. */
@@ -46,8 +53,17 @@ static inline void add_product(const fourier *f, real *restrict to, const real *
     }
 }
 
-/* Set `to` to a row of the matrix times n spectra x. */
-void multiply_row(const fourier *f, real *to, const real *row, const real *x, int32_t n);
+/* Set a matrix to the spectra of n of the N lags of each pair of signals, (C, C, N). */
+void transform_all_lags(const fourier *f, real *A, const real *lags, int32_t C, int32_t N,
+                        int32_t n, int smooth);
+/* Add white noise of this power to a spectrum. */
+static inline void add_white(const fourier *f, real *spectrum, real power)
+{
+    for (int32_t k = 0; k < f->half; k++) spectrum[k] += power;
+}
+/* Set `to` to the first rows of the matrix times n spectra x. */
+void multiply_rows(const fourier *f, real *to, const real *A, const real *x, int32_t rows,
+                   int32_t n);
 /* Factorise the lower triangle of a Hermitian matrix in place, at each frequency; the diagonal
  * becomes 1 / the factor's. Where it is singular, but for rounding, that is 0. */
 void factorise_spectra(const fourier *f, real *A, int32_t n);

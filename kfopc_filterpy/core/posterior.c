@@ -180,9 +180,8 @@ static void multiply_data(posterior *f, real *to, const real *t, real q)
     const int32_t C = f->C, N = f->N;
     const size_t each = (size_t)F->F;
     real *T = f->spectra, *out = f->products;
-    for (int32_t c = 0; c < C; c++) transform(F, T + (size_t)c * each, t + times(c, N), N);
-    for (int32_t a = 0; a < C; a++)
-        multiply_row(F, out + (size_t)a * each, f->T_at + times(a * C, F->F), T, C);
+    transform_rows(F, T, t, C, N);
+    multiply_rows(F, out, f->T_at, T, C, C);
     leave_out(f, f->ahead_at, T, out, 1, N, 1);
     leave_out(f, f->before_at, T, out, 0, N - 1, -1);
     for (int32_t c = 0; c < C; c++) {
@@ -214,15 +213,10 @@ static void prepare(posterior *f, real q)
 {
     const fourier *F = &f->fourier;
     const int32_t C = f->C, N = f->N;
-    for (int32_t a = 0; a < C; a++)
-        for (int32_t c = 0; c < C; c++) {
-            const real *ahead = f->T + times(c * C + a, N), *behind = f->T + times(a * C + c, N);
-            real *factor = f->factor + times(a * C + c, F->F);
-            transform_lags(F, f->T_at + times(a * C + c, F->F), ahead, behind, N, 0);
-            transform_lags(F, factor, ahead, behind, N, 1);
-            const real ridge = a == c ? q * precision_of(f, c) : 0;
-            for (int32_t k = 0; k < F->half; k++) factor[k] += ridge;
-        }
+    transform_all_lags(F, f->T_at, f->T, C, N, N, 0);
+    transform_all_lags(F, f->factor, f->T, C, N, N, 1);
+    for (int32_t c = 0; c < C; c++)
+        add_white(F, f->factor + times(c * C + c, F->F), q * precision_of(f, c));
     factorise_spectra(F, f->factor, C);
     for (int32_t c = 0; c < C; c++) {
         transform(F, f->ahead_at + times(c, F->F), f->faded + times(c, f->history), N);
@@ -423,10 +417,7 @@ static void begin_data(posterior *f, int32_t newest)
             before[N - 2 - i] = turned[i] =
                 (c < f->I ? 1 : -1) * f->taper[i] * history_of(f, c)[newest + i];
     }
-    for (int32_t a = 0; a < C; a++)
-        for (int32_t c = 0; c < C; c++)
-            add_lags(&f->fourier, f->T + times(a * C + c, N), reversed + times(a, 2 * N), N,
-                     reversed + times(c, 2 * N), N);
+    add_all_lags(&f->fourier, f->T, reversed, reversed, C, 2 * N, N, N);
 }
 
 /* Let numbers fade. */
@@ -460,10 +451,7 @@ static void add_samples(posterior *f, int32_t newest, int believed, real expecte
     let_fade(f->T, times(C * C, N), share);
     let_fade(f->r, times(f->K * C, N), share);
     let_fade(taps_of(f, f->r, f->K, 0), times((f->rows - f->K) * C, N), root(share));
-    for (int32_t a = 0; a < C; a++)
-        for (int32_t c = 0; c < C; c++)
-            add_lags(&f->fourier, f->T + times(a * C + c, N), faded_of(f, a), newest,
-                     faded_of(f, c), N);
+    add_all_lags(&f->fourier, f->T, f->faded, f->faded, C, f->history, newest, N);
     for (int32_t row = 0; row < f->rows; row++) {
         hear_row(f, row, newest, believed, heard);
         for (int32_t c = 0; c < C; c++)
