@@ -35,7 +35,7 @@ enum { SHORTER = 5 };
 /* A sound does not grow by more than this from one sample to the next, but a click does. */
 static const real GROWTH = 10;
 /* Steps of conjugate gradients towards filters. */
-enum { FILTER_STEPS = 6 };
+enum { FILTER_STEPS = 12 };
 /* No filter has a larger tap. REGULAR: share of the powers of x that is added to them, and of the
  * paths' gains that is added to the prices, so that rounding leaves the matrix definite. */
 #ifdef ANC_FLOAT
@@ -60,7 +60,7 @@ typedef struct {
     real *lags;               /* (I, I, N) of the window, into which the newest block fades in */
     real *R_at, *smooth_R;    /* (I, I) spectra: of the lags, of a circulant near to them */
     real *SS, *gain;          /* (J, J) spectra of the secondary paths; (J) mean of the diagonal */
-    real *smooth_A, *factor;  /* (J, I, J, I) spectra: of the filtered references, and priced */
+    real *factor;             /* (J, I, J, I) spectra: of a matrix near to A + price R */
     real *b;                  /* (J, I, L) */
     real *spectra, *products; /* (J, I), (J, I) spectra */
     real *vectors;            /* (4, J, I, L) */
@@ -118,7 +118,6 @@ static void layout_budget(anc_view *view, const anc_plan *plan, anc_layout *at)
     f->smooth_R = reals(at, "smooth_reference_spectra", ANC_SCRATCH, 1, I, I, spectrum);
     f->SS = reals(at, "path_spectra", ANC_SCRATCH, 1, J, J, spectrum);
     f->gain = reals(at, "path_gains", ANC_SCRATCH, 1, 1, 1, J);
-    f->smooth_A = reals(at, "smooth_spectra", ANC_SCRATCH, J * I, J, I, spectrum);
     f->factor = reals(at, "priced_factor", ANC_SCRATCH, J * I, J, I, spectrum);
     f->b = reals(at, "with_disturbance", ANC_SCRATCH, 1, J, I, L);
     f->spectra = reals(at, "filter_spectra", ANC_SCRATCH, 1, J, I, spectrum);
@@ -258,27 +257,18 @@ static void correlate_paths(budget *f)
     }
 }
 
-/* Set a circulant near to A = SS R, the gains, and b. */
+/* Set b, and the gains of the paths. */
 static void set_equations(budget *f)
 {
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const fourier *F = &f->posterior.fourier;
-    real *sums = f->spectra, *lags = scratch_row(F, 3), *behind = scratch_row(F, 4);
+    real *sums = f->spectra;
     correlate_paths(f);
     for (int32_t j = 0; j < J; j++) {
         multiply_rows(F, sums, f->R_at, f->products + times(j * I, F->F), I, I);
         transform_rows_back(F, f->b + times(j * I, L), sums, I, L);
         transform_back(F, f->gain + j, f->SS + times(j * J + j, F->F), 1);
     }
-    for (int32_t ji = 0; ji < J * I; ji++)
-        for (int32_t ac = 0; ac <= ji; ac++) {
-            const int32_t j = ji / I, i = ji % I, a = ac / I, c = ac % I;
-            multiply_rows(F, sums, f->SS + times(j * J + a, F->F), f->R_at + times(i * I + c, F->F),
-                          1, 1);
-            transform_back(F, lags, sums, F->F);
-            for (int32_t l = 1; l < L; l++) behind[l] = -lags[F->F - l]; /* it is skew */
-            transform_lags(F, f->smooth_A + times(ji * J * I + ac, F->F), lags, behind, L, 1);
-        }
 }
 
 /* Set to = (A + price R) v for all filters. */
@@ -310,20 +300,29 @@ static void precondition_filters(void *self, real *to, const real *r)
     solve_circulants(&f->posterior.fourier, f->factor, f->spectra, to, r, f->s.J * f->s.I, f->s.L);
 }
 
+/* Factorise (SS + price) R at each frequency, with a smooth R. At frequencies where the paths leave
+ * a direction of v open, A has none of it, nor has this matrix: the price alone decides. */
+static void factorise_filters(budget *f)
+{
+    const int32_t I = f->s.I, J = f->s.J;
+    const fourier *F = &f->posterior.fourier;
+    for (int32_t ji = 0; ji < J * I; ji++)
+        for (int32_t ac = 0; ac <= ji; ac++) {
+            const int32_t j = ji / I, i = ji % I, a = ac / I, c = ac % I;
+            const real *R = f->smooth_R + times(i * I + c, F->F);
+            real *at = f->factor + times(ji * J * I + ac, F->F);
+            multiply_rows(F, at, f->SS + times(j * J + a, F->F), R, 1, 1);
+            if (j == a) add_scaled(at, f->price[j] + REGULAR * f->gain[j], R, F->F);
+        }
+    factorise_spectra(F, f->factor, J * I);
+}
+
 /* Go some steps from the last filters towards those at the prices. */
 static void solve_filters(budget *f)
 {
-    const int32_t I = f->s.I, J = f->s.J, n = J * I * f->s.L;
-    const fourier *F = &f->posterior.fourier;
+    const int32_t n = f->s.J * f->s.I * f->s.L;
     const equations own = {f, multiply_filters, precondition_filters, n, f->vectors};
-    copy(f->factor, f->smooth_A, times(J * I * J * I, F->F));
-    for (int32_t j = 0; j < J; j++)
-        for (int32_t i = 0; i < I; i++)
-            for (int32_t c = 0; c <= i; c++)
-                add_scaled(f->factor + times((j * I + i) * J * I + j * I + c, F->F),
-                           f->price[j] + REGULAR * f->gain[j], f->smooth_R + times(i * I + c, F->F),
-                           F->F);
-    factorise_spectra(F, f->factor, J * I);
+    factorise_filters(f);
     approach(&own, f->b, f->now, FILTER_STEPS);
     for (int32_t i = 0; i < n; i++)
         if (!within(f->now[i], LARGEST_TAP)) {

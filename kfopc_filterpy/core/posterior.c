@@ -542,6 +542,14 @@ static real energy_of_block(const posterior *f, int32_t begin, int32_t end)
     return energy;
 }
 
+/* Return whether the data have told little about p, and the noise in which they were heard has
+ * gone. */
+static int noise_has_gone(const posterior *f, const judgement *is)
+{
+    const real noise = mean_noise(f) * count_of(f, f->B) * (real)f->K;
+    return 2 * f->numbers->significant < 1 && LOUDER * LOUDER * is->missed < noise;
+}
+
 /* Learn from the newest samples of a block; 0: its errors are not known. */
 static void learn_samples(posterior *f, int32_t newest, real forget)
 {
@@ -555,8 +563,10 @@ static void learn_samples(posterior *f, int32_t newest, real forget)
     const real x2 = energy_of_block(f, 0, f->I), y2 = energy_of_block(f, f->I, f->C);
     const real x2_of_data = energy_of_data(f, 0, f->I), y2_of_data = energy_of_data(f, f->I, f->C);
     if (believed) {
-        if (x2 > LOUDER * x2_of_data)
-            begin_data(f, believed); /* what soft samples told is little */
+        const int noise_gone = known && noise_has_gone(f, &is);
+        if (noise_gone) clear(f->q, (size_t)f->K);
+        if (noise_gone || x2 > LOUDER * x2_of_data)
+            begin_data(f, believed); /* what the data told is little */
         add_samples(f, believed, 1, is.expected, forget);
     } else if (!f->counts[WAITING]) {
         if (x2 >= x2_of_data || y2 > y2_of_data || !(f->numbers->samples > 0))

@@ -65,13 +65,17 @@ def toeplitz(R, n):
     return R[:, :, np.subtract.outer(range(n), range(n))].swapaxes(1, 2).reshape(A * n, C * n)
 
 
-def preconditioner(R, n):
-    """Return the inverse, cut to n taps, of a skew-circulant near to the Toeplitz matrix of n lags: it is definite, too."""
+def spectra(R, n=math.inf):
+    """Return the spectra of lags of both signs at odd frequencies, under a triangle that ends at n: those of a circulant."""
     F, order = R.shape[2], np.arange(R.shape[2])
     lag = np.where(order < F / 2, order, order - F)
     turn = np.exp(-1j * np.pi * lag / F)  # to the odd frequencies
-    spectra = np.fft.fft(R * np.maximum(1 - abs(lag) / n, 0) * turn)
-    return toeplitz((np.fft.ifft(np.linalg.inv(spectra.T).T) / turn).real, n)
+    return np.fft.fft(R * np.maximum(1 - abs(lag) / n, 0) * turn), turn
+
+
+def preconditioner(R, turn, n):
+    """Return the inverse of a skew-circulant, cut to n taps, from its spectra."""
+    return toeplitz((np.fft.ifft(np.linalg.inv(R.T).T) / turn).real, n)
 
 
 def conjugate_gradients(A, W, b, v, steps):
@@ -155,14 +159,18 @@ class Plant:
             return
         Z, e = regressors(z, N) * w[:, None], e * w
         d = self.significant * self.theta[:K, : self.split] @ Z[:, : self.split].T
+        noise_gone = False
         if new and known:
             missed = np.mean((e - d - self.theta[:K, self.split :] @ Z[:, self.split :].T) ** 2, axis=0)
             new = new if self.believes(missed, np.sum(d**2) / (K * np.sum(w**2)), heard, z, Z, w) else 0
+            noise_gone = self.significant < 0.5 and core.LOUDER**2 * np.sum(missed) < np.mean(self.q) * np.sum(w**2)
         x2, y2 = (np.sum((z[part, -self.B :] * w) ** 2) for part in (slice(I), slice(I, None)))
         x2_of_data, y2_of_data = self.energy_of(slice(I)), self.energy_of(slice(I, None))
         if new:
-            if x2 > core.LOUDER * x2_of_data:
-                self.begin(z, new)  # what soft samples told is little
+            if noise_gone:
+                self.q = np.zeros(K)
+            if noise_gone or x2 > core.LOUDER * x2_of_data:
+                self.begin(z, new)  # what the data told is little
             self.add(Z, d, e, new)
         elif not self.waiting and (self.count == 0 or x2 >= x2_of_data or y2 > y2_of_data):
             self.begin(z, 0)  # the block would stand for more than is known
@@ -226,7 +234,7 @@ class Plant:
         R = two_sided(T)
         R[range(self.C), range(self.C), 0] += ridge[::N]
         weight = self.mask * np.tile(self.g ** (np.arange(N) / 2), self.C)
-        W = preconditioner(R, N) * np.outer(weight, weight)
+        W = preconditioner(*spectra(R, N), N) * np.outer(weight, weight)
         A = self.G + np.diag(ridge)
         due = core.DRAWS if self.fresh else min(math.ceil(core.DRAWS * self.B / self.count), core.DRAWS)
         turns = (self.turn + np.arange(due)) % core.DRAWS
@@ -404,15 +412,17 @@ class PowerBudget(Controller):
         P, S, X = (np.fft.rfft(u, self.R_lags.shape[2]) for u in (p, s, self.R_lags))
         A = np.einsum("kjf,kaf,icf->jiacf", S.conj(), S, X, optimize=True)
         self.A_lags = np.fft.irfft(A).reshape(J * I, J * I, -1)
+        self.SS, self.turn = spectra(np.fft.irfft(np.einsum("kjf,kaf->jaf", S.conj(), S)))
         b = np.einsum("kjf,kcf,icf->jif", S.conj(), P, X, optimize=True)
         self.b = np.fft.irfft(b)[..., :L].ravel()
         self.gain = np.sum(s**2, axis=(0, 2))
 
     def solved(self, price, v):
         """Return filters after some steps from v towards those at the prices."""
-        price = np.diag(price + core.REGULAR * self.gain)
-        lags, L = self.A_lags + np.kron(price[:, :, None], self.R_lags), self.w.shape[2]
-        self.W = preconditioner(lags, L)
+        price = np.diag(price + core.REGULAR * self.gain)[..., None]
+        lags, L = self.A_lags + np.kron(price, self.R_lags), self.w.shape[2]
+        near = np.einsum("jaf,icf->jiacf", self.SS + price, spectra(self.R_lags, L)[0])
+        self.W = preconditioner(near.reshape(lags.shape), self.turn, L)
         return conjugate_gradients(toeplitz(lags, L), self.W, self.b, v.ravel(), core.FILTER_STEPS).reshape(v.shape)
 
     def next_price(self, price, v, target):
