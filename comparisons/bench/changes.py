@@ -67,6 +67,18 @@ def _click(x: np.ndarray, at: int, fs: float) -> np.ndarray:
     return clicked
 
 
+def _joined(louder_db: float, lasting_s: float) -> Change:
+    """Return a change in which a noise joins that the reference does not know."""
+
+    def join(d: np.ndarray, at: int, fs: float) -> np.ndarray:
+        n = min(round(lasting_s * fs), d.size - at)
+        other = np.zeros(d.size)
+        other[at : at + n] = np.random.default_rng(at).standard_normal(n)
+        return d + 10 ** (louder_db / 20) * np.sqrt(np.mean(d**2)) * other
+
+    return Change(disturbance=join, lasting_s=lasting_s)
+
+
 def _faded(level: float, fade_s: float = 0.0) -> SignalChange:
     """Return a function that makes a signal soft before the event, with a fade in up to it."""
 
@@ -88,6 +100,7 @@ CHANGES: dict[str, Change] = {
     "noise 12 dB softer": Change(noise=_then(lambda x: 10**-0.6 * x)),
     "noise 12 dB louder": Change(noise=_then(lambda x: 10**0.6 * x)),
     **{f"reference dead for {lasting_s:g} s": _dead(lasting_s) for lasting_s in (1.0, 10.0)},
+    "another noise, 30 dB louder, for 1 s": _joined(30.0, 1.0),
     "a reference sample of 1e4": Change(reference=_click),
     **{f"soft past, {level}": Change(noise=_faded(float(level))) for level in ("1e-3", "1e-6")},
     "fades in over 4 s from 1e-4": Change(noise=_faded(1e-4, 4.0)),

@@ -43,6 +43,7 @@ EVENTS: dict[str, tuple[str, float, dict[str, float]]] = {  # by name: what chan
             "noise 12 dB softer": 12.0,
             "noise 12 dB louder": 12.0,
             "reference dead for 10 s": 8.0,
+            "another noise, 30 dB louder, for 1 s": 8.0,
             "a reference sample of 1e4": 8.0,
             "soft past, 1e-3": 6.0,
             "soft past, 1e-6": 6.0,

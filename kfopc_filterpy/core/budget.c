@@ -36,6 +36,8 @@ enum { SHORTER = 5 };
 static const real GROWTH = 10;
 /* Steps of conjugate gradients towards filters. */
 enum { FILTER_STEPS = 12 };
+/* Share of a path's gain that filters of few taps have in directions of which spectra have none. */
+static const real LEAK = (real)1e-4;
 /* No filter has a larger tap. REGULAR: share of the powers of x that is added to them, and of the
  * paths' gains that is added to the prices, so that rounding leaves the matrix definite. */
 #ifdef ANC_FLOAT
@@ -300,8 +302,9 @@ static void precondition_filters(void *self, real *to, const real *r)
     solve_circulants(&f->posterior.fourier, f->factor, f->spectra, to, r, f->s.J * f->s.I, f->s.L);
 }
 
-/* Factorise (SS + price) R at each frequency, with a smooth R. At frequencies where the paths leave
- * a direction of v open, A has none of it, nor has this matrix: the price alone decides. */
+/* Factorise (SS + price) R at each frequency, with a smooth R. With more loudspeakers than
+ * microphones, SS leaves directions of v open, in which A has nearly nothing, nor has this matrix:
+ * only the price decides there. */
 static void factorise_filters(budget *f)
 {
     const int32_t I = f->s.I, J = f->s.J;
@@ -312,7 +315,7 @@ static void factorise_filters(budget *f)
             const real *R = f->smooth_R + times(i * I + c, F->F);
             real *at = f->factor + times(ji * J * I + ac, F->F);
             multiply_rows(F, at, f->SS + times(j * J + a, F->F), R, 1, 1);
-            if (j == a) add_scaled(at, f->price[j] + REGULAR * f->gain[j], R, F->F);
+            if (j == a) add_scaled(at, f->price[j] + LEAK * f->gain[j], R, F->F);
         }
     factorise_spectra(F, f->factor, J * I);
 }
