@@ -64,6 +64,16 @@ def test_import_leaves_heavy_modules_for_later_and_warns_of_nothing(statement):
     assert run.stdout.split() == [], f"{statement} loads {run.stdout.strip()}"
 
 
+def test_the_studies_name_what_they_miss():
+    """Each package of their extra is looked for before any study is imported."""
+    extra = tomllib.loads(read("pyproject.toml"))["project"]["optional-dependencies"]["studies"]
+    names = [Requirement(line).name for line in extra]
+    code = f"import sys; sys.modules.update(dict.fromkeys({names})); import comparisons"
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert f"ImportError: the studies need {', '.join(names)}" in run.stderr
+    assert '-m pip install -e ".[studies]"' in run.stderr
+
+
 def test_every_python_that_is_started_ignores_the_current_folder():
     """A json.py beside a user's recordings is not ours to run."""
     started = [
