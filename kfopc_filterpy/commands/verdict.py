@@ -123,7 +123,9 @@ def verdict(options: argparse.Namespace) -> int:
             found = assessed(rating=ratings_of(options, plant.n_loudspeakers))
         else:
             found, table = cheapest_enough(options, plant.n_loudspeakers, lambda rating: assessed(rating=rating))
-        advice = advice_on(found, fs="--fs ", n_taps="--taps ")
+        advice = advice_on(
+            found, fs="--fs ", n_taps="--taps ", noise_rating="--rating noise", peak_volts="--peak-volts"
+        )
         origin = {"Command": options.command, "Files": "; ".join(files.read)}
         if table:
             origin["Amplifiers"] = "; ".join(f"{row[0]}: enough {row[-2]}, {row[-1]} dB to spare" for row in table.rows)

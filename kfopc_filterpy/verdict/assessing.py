@@ -153,7 +153,7 @@ def assess(
     -----
     The cause is the first ceiling that does not reach `want_db`; see `Ceilings`. If all of them do and the run does
     not, the amplifier is the cause if a run with more power reaches it (peaks and short windows cost more than the mean
-    power), otherwise the adaptation is.
+    power), otherwise the adaptation is. A run with an amplifier that does not clip tells whether the peaks do.
 
     The least rated power is found by bisection: the run is repeated with other ratings, about six times. They do not
     depend on the rating that is given, only on its proportions: of the loudspeakers, and of peak and mean power.
@@ -265,6 +265,10 @@ def assess(
         least = _least_share(plan, algorithm, want_db, np.max(first / limits.rated_power), unit)
     if cause == "adaptation" and np.isfinite(least):
         cause = "amplifier"
+    unclipped_db = None
+    if cause == "amplifier" and within_power_db >= want_db and limits.has_peaks:
+        announce(bar, plan.planned_samples(algorithm), "without clipping")
+        unclipped_db = _reduction(replace(plan, limits=limits.without_peaks(), chosen={}).run(algorithm, limited=True))
     figures = {name: _figures(one, limits, fs, plan.chosen[name]) for name, one in runs.items()}
     notes += _on_better_runs(figures, algorithm) + _on_louder_bands(run)
     if watts is None:
@@ -293,6 +297,7 @@ def assess(
         unlimited_power=bounds.free.control_power,
         required_rated_power=required,
         least_rated_power=least * limits.rated_power,
+        unclipped_db=unclipped_db,
         causality_margin_s=margin_s,
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
         band=_band(bounds.d, s, fs),

@@ -9,8 +9,7 @@ ceiling               what it may use
 coherence             everything that the reference explains of the disturbance, the future included
 time                  a filter of `n_taps` taps with as much time as it likes, and any power
 filter                a filter of `n_taps` taps, in time, and any power
-path                  the same, held back where the secondary path is not known well enough
-power                 the same, within the rated power
+power                 the same, within the rated power, which is a mean: its peaks are not clipped
 run                   the controller itself, adapting, behind its limiter and a clipping amplifier
 ===================== ==============================================================================================
 
@@ -37,6 +36,7 @@ from kfopc_filterpy.bounds import SuggestedSettings
 from .._types import NumberOrArray
 from .._writing import jsonable, prepare_folder, replacing_files
 from ..paths import FeedbackMargin
+from ..power.ratings import SINE_CREST
 from .fixed_filters import longest_filter
 from .limits import Limits, watt_per_power
 
@@ -61,7 +61,7 @@ class Ceilings:
     filter_db : float
         A filter of this length, with any power.
     power_db : float
-        The same, within the rated power.
+        The same, within the rated power; its peaks are not clipped.
     """
 
     coherence_db: float | None
@@ -142,6 +142,9 @@ class Assessment:
     least_rated_power : float or ndarray, shape (J,)
         Least rated power with which the controller's run reaches the noise reduction wanted, found by runs to 1 %; the
         peaks that the rating allows are changed with it. Inf if none does.
+    unclipped_db : float or None
+        Noise reduction of the controller's run with the same rated power and an amplifier that does not clip; None unless
+        the amplifier is the cause although the bound within the rated power reaches the noise reduction wanted.
     causality_margin_s : float or None
         Time by which the anti-noise is early; None without a primary path.
     helpful_delay_s : float or None
@@ -196,6 +199,7 @@ class Assessment:
     unlimited_power: Any
     required_rated_power: Any
     least_rated_power: Any
+    unclipped_db: float | None
     causality_margin_s: float | None
     helpful_delay_s: float | None
     band: Band
@@ -228,26 +232,49 @@ class Assessment:
         missed = self.noise_reduction_db - self.want_db
         if not np.isfinite(missed):
             return f"{answer}: {self.algorithm} diverges with {self.power(self.limits.rated_power)}."
+        want = f"{self.want_db:g} dB wanted"
+        if round(missed, 1):
+            compared = f"{abs(missed):.1f} dB {'more' if missed > 0 else 'less'} than the {want}"
+        else:
+            compared = f"just {'enough for' if missed >= 0 else 'short of'} the {want}"
         weighted = _db(self.figures[self.algorithm]["noise_reduction_dba"])
         return (
             f"{answer}: {self.algorithm} reaches {_db(self.noise_reduction_db)} ({weighted} A-weighted) with "
-            f"{self.power(self.limits.rated_power)}, "
-            f"{abs(missed):.1f} dB {'more' if missed >= 0 else 'less'} than the {self.want_db:g} dB wanted, in a run of "
+            f"{self.power(self.limits.rated_power)}, {compared}, in a run of "
             f"{self.runs[self.algorithm].n_samples / self.fs:.3g} s."
         )
 
     @property
     def reason(self) -> str:
-        """What limits, as one sentence; empty if the rating is enough."""
-        if self.limited_by is None:
+        """What limits, as one sentence or two; empty if the rating is enough."""
+        cause = self.limited_by
+        if cause is None:
             return ""
+        if cause == "amplifier" and self.ceilings.power_db >= self.want_db:
+            cause = "peaks" if self.limited_by_peaks else "windows"
         ceilings = {name: "" if value is None else _db(value) for name, value in vars(self.ceilings).items()}
-        return _REASONS[self.limited_by].format(
+        return _REASONS[cause].format(
             **ceilings,
             reached=_db(self.noise_reduction_db),
             taps=self.settings.n_taps,
             rated=self.power(self.limits.rated_power),
+            peak=self.peak,
+            share=_each(100 * self.figures[self.algorithm]["of_rated_power"], ".2g", " %"),
+            unclipped="" if self.unclipped_db is None else _db(self.unclipped_db),
+            window=self.limits.window_s,
         )
+
+    @property
+    def limited_by_peaks(self) -> bool:
+        """Whether the run would reach the noise reduction wanted with the same rated power if nothing clipped."""
+        return self.unclipped_db is not None and self.unclipped_db >= self.want_db
+
+    @property
+    def peak(self) -> str:
+        """Largest magnitude of the control signal in words: in V if its scale is known."""
+        volts = self.volts_per_unit
+        peaks = np.array(self.limits.amplitude_limit, dtype=float) * (1.0 if volts is None else volts)  # NaN of None
+        return _each(peaks, ".3g", "" if volts is None else " V")
 
     @property
     def stability(self) -> str:
@@ -283,7 +310,7 @@ class Assessment:
         same = (
             *("enough", "verdict", "limited_by", "reason", "advice", "notes", "want_db", "noise_reduction_db"),
             *("algorithm", "bound_db", "unlimited_power", "required_rated_power", "least_rated_power"),
-            *("causality_margin_s", "helpful_delay_s", "fs", "origin"),
+            *("unclipped_db", "causality_margin_s", "helpful_delay_s", "fs", "origin"),
         )
         rating = {
             name: getattr(self.limits, name) for name in ("rated_power", "amplitude_limit", "window_s", "decided_by")
@@ -328,11 +355,14 @@ class Assessment:
 
 
 def _each(values: Any, form: str, unit: str = "", all_the_same: str = " each") -> str:
-    """Return a number, or those of several loudspeakers, as text: "20 W", "20 W each" or "20, 10 W"."""
-    texts = [format(float(format(value, form)), "g") for value in np.ravel(values)]  # 1250, not 1.25e+03
-    if np.ndim(values) and len(set(texts)) == 1:
+    """Return a number, or those of several loudspeakers, as text: "20 W", "20 W each" or "20 and 10 W"."""
+    texts = [
+        "none" if np.isnan(value) else format(float(format(value, form)), "g")  # 1250, not 1.25e+03
+        for value in np.ravel(values)
+    ]
+    if len(set(texts)) == 1:
         return f"{texts[0]}{unit}{all_the_same if len(texts) > 1 else ''}"
-    return f"{', '.join(texts)}{unit}"
+    return f"{', '.join(texts[:-1])} and {texts[-1]}{unit}"
 
 
 def nominal_hz(centre: float) -> str:
@@ -353,13 +383,24 @@ _REASONS = {
     "with any power.",
     "filter": "The filter limits: {taps} taps reach {filter_db} with any power, and more time does not help.",
     "amplifier": "The amplifier limits: with any power {filter_db} are in reach, with {rated} {power_db} for a fixed filter.",
+    "peaks": "The amplifier's peak voltage limits: what is above {peak} is clipped, although the run takes only {share} of "
+    "the rated power. Without clipping it would reach {unclipped} with {rated}.",
+    "windows": "The amplifier limits: with {rated} a fixed filter reaches {power_db}, but the run, which keeps the rated power "
+    "in each window of {window:g} s, only {reached}.",
     "adaptation": "The adaptation limits: a fixed filter reaches {power_db} within the rated power, the controller {reached}, "
     "and more power does not help it.",
 }
 
 
-def advice_on(verdict: Assessment, *, fs: str = "fs=", n_taps: str = "n_taps=") -> list[str]:
-    """Return what to change, in sentences; `fs` and `n_taps` are what the caller writes before these settings."""
+def advice_on(
+    verdict: Assessment,
+    *,
+    fs: str = "fs=",
+    n_taps: str = "n_taps=",
+    noise_rating: str = "noise_watt",
+    peak_volts: str = "peak_volts",
+) -> list[str]:
+    """Return what to change, in sentences; the other arguments are what the caller calls these settings."""
     want = f"{verdict.want_db:g} dB"
     needed = verdict.least_rated_power
     enough = [f"About {verdict.power(needed)} would do for {want}: the least with which the run reaches it."]
@@ -398,6 +439,11 @@ def advice_on(verdict: Assessment, *, fs: str = "fs=", n_taps: str = "n_taps=") 
             f"A fixed filter would need {verdict.power(verdict.required_rated_power)} for {want}; this controller does not "
             "reach it with any power. Try a longer record."
         ]
+    if verdict.limited_by_peaks:
+        crest = np.array(verdict.limits.amplitude_limit, dtype=float) / np.sqrt(verdict.limits.rated_power)
+        of_a_sine = np.any(np.isclose(crest, SINE_CREST))
+        noise = f"If the data sheet states watts of noise, give {noise_rating}; if" if of_a_sine else "If"
+        advice.append(f"{noise} the amplifier clips at a higher voltage, give {peak_volts}.")
     if verdict.band.weak_share > 0.1:
         advice.append(
             f"{verdict.band.weak_share:.0%} of the noise lies where the loudspeaker is weak: a loudspeaker for "

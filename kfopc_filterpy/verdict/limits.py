@@ -47,6 +47,11 @@ class Limits:
         return self.own(one.amplitude_limit for one in self.each)
 
     @property
+    def has_peaks(self) -> bool:
+        """Whether a peak of any loudspeaker is limited."""
+        return any(one.amplitude_limit is not None for one in self.each)
+
+    @property
     def window_s(self) -> float:
         """Time in seconds over which the mean squares count."""
         return min(one.window_s for one in self.each)
@@ -64,6 +69,10 @@ class Limits:
         """Return an amplifier that clips at the limit."""
         peaks = (one.amplitude_limit for one in self.each)
         return self.own(LinearAmplifier() if peak is None else HardClipAmplifier(peak) for peak in peaks)
+
+    def without_peaks(self) -> Limits:
+        """Return limits with the same rated powers, and none of the peaks."""
+        return replace(self, each=tuple(replace(one, amplitude_limit=None) for one in self.each))
 
     def scaled(self, share: float) -> Limits:
         """Return limits with `share` times the rated powers, and peaks in proportion."""

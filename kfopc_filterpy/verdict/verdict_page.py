@@ -34,7 +34,7 @@ CHAIN = (  # what each ceiling may use, and the cause if it is too low
     ("coherence_db", "Everything that the reference explains of the disturbance", "coherence"),
     ("time_db", "A filter of {taps} taps that may look ahead, any power", "filter"),
     ("filter_db", "A filter of {taps} taps, in time, any power", "causality"),
-    ("power_db", "The same, within the rated power", "amplifier"),
+    ("power_db", "The same, within the rated power, which is a mean: its peaks are not clipped", "amplifier"),
 )
 
 
@@ -70,7 +70,8 @@ def _figures(verdict: Assessment) -> Iterator[FigureItem]:
     each = "the run of each algorithm at the power it took"
     if verdict.channels is not None:
         each += ", relative to its rating, of the loudspeaker that took most"
-    caption = f"What a rated power buys: the least error of any fixed filter of this length, with {each}."
+    caption = f"What a rated power buys: the least error of any fixed filter of this length, with {each}. "
+    caption += "The bound knows the mean power and not the clipping, which the runs meet."
     if np.all(np.isfinite(verdict.least_rated_power)):
         caption += f" Least: the least with which {verdict.algorithm}, which adapts, reaches what is wanted."
     yield FigureItem("bound", caption, _bound(verdict).figure)
@@ -190,12 +191,17 @@ def _tables(verdict: Assessment) -> Any:
     """Yield the tables: what limits, the algorithms, the bands."""
     taps = verdict.settings.n_taps
     rows: list[list[str | float]] = []
+    limit = verdict.limited_by
+    if limit == "amplifier" and verdict.ceilings.power_db >= verdict.want_db:
+        limit = "adaptation"  # clipping, or short windows: what only the run meets
     for name, what, cause in CHAIN:
         value = getattr(verdict.ceilings, name)
-        mark = "limits" if cause == verdict.limited_by else ""
+        mark = "limits" if cause == limit else ""
         rows.append([what.format(taps=taps), "not measured" if value is None else f"{value:.1f} dB", mark])
-    adapting = "limits" if verdict.limited_by == "adaptation" else ""
-    rows.append([f"The run of {verdict.algorithm}", f"{verdict.noise_reduction_db:.1f} dB", adapting])
+    run = f"The run of {verdict.algorithm}"
+    if verdict.unclipped_db is not None:
+        rows.append([f"{run}, with an amplifier that does not clip", f"{verdict.unclipped_db:.1f} dB", ""])
+    rows.append([run, f"{verdict.noise_reduction_db:.1f} dB", "limits" if limit == "adaptation" else ""])
     rows.append(["Wanted", f"{verdict.want_db:.1f} dB", ""])
     yield Table("ceilings", "What limits", ["Ceiling", "Noise reduction", ""], rows)
     yield algorithms_table(verdict)
@@ -269,7 +275,8 @@ def _checks(verdict: Assessment) -> dict[str, str]:
     elif late is not None:
         causality = f"the anti-noise is {abs(1e3 * late):.2g} ms {'early' if late >= 0 else 'late'}"
     checks = {
-        "Rating": f"{verdict.power(limits.rated_power)}, decided by the {', '.join(decided)}; {_peak_limits(verdict)}; "
+        "Rating": f"{verdict.power(limits.rated_power)}, decided by the {', '.join(decided)}; "
+        f"{f'peaks up to {verdict.peak}' if limits.has_peaks else 'no peak limit'}; "
         f"windows of {limits.window_s:g} s",
         "Power for full control": verdict.power(verdict.unlimited_power),
         f"{least}, best fixed filter": _or_none(verdict, verdict.required_rated_power),
@@ -284,17 +291,6 @@ def _checks(verdict: Assessment) -> dict[str, str]:
         before, after = (listed(one, ".1f") for one in (verdict.levels.before_dba, verdict.levels.after_dba))
         checks["A-weighted level"] = f"{before} dBA without control, {after} dBA with it"
     return checks
-
-
-def _peak_limits(verdict: Assessment) -> str:
-    """Return the peak limits in words."""
-    limits: Any = verdict.limits.amplitude_limit
-    if limits is None:
-        return "no peak limit"
-    if verdict.channels is None:
-        in_volts = verdict.volts_per_unit is not None
-        return f"peak limit {_number(limits, verdict.volts_per_unit):.3g}{' V' if in_volts else ''}"
-    return f"peak limits {', '.join('none' if one is None else f'{one:.3g}' for one in limits)}"
 
 
 def _or_none(verdict: Assessment, power: Any) -> str:

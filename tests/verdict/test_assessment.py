@@ -22,7 +22,7 @@ from kfopc_filterpy.signals import Recording, band_limited_noise
 from kfopc_filterpy.verdict import assess
 from kfopc_filterpy.verdict.assessment import CAUSES, SCHEMA, advice_on
 from kfopc_filterpy.verdict.candidates import STEP_SIZES
-from kfopc_filterpy.verdict.verdict_page import _bound
+from kfopc_filterpy.verdict.verdict_page import _bound, _tables
 
 FS, SECONDS, TAPS = 8000, 3.0, 32
 PLENTY = 100.0  # times what full control takes
@@ -97,12 +97,55 @@ def test_a_fault_is_found_as_the_cause_and_without_it_the_same_scene_is_enough(c
     assert repr(better).startswith(f"Enough: {better.algorithm} reaches")
 
 
-def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing():
+def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing(tmp_path):
     """Noise within the mean power has peaks beyond a sine's: a fixed filter would do, the run does not, with more it does."""
-    small = on(rating=AmplifierRating(ohm=1.0, sine_watt=0.75), want_db=14.0)
+    small = on(rating=AmplifierRating(ohm=8.0, sine_watt=0.75 * 2, volts_per_unit=4.0), want_db=14.0)
     assert small.ceilings.power_db >= 14.0
     assert small.limited_by == "amplifier"
-    assert on(rating=AmplifierRating(ohm=1.0, sine_watt=8.0), want_db=14.0).enough
+    share = 100 * small.figures["KF-PB"]["of_rated_power"]
+    assert small.reason == (
+        f"The amplifier's peak voltage limits: what is above 4.9 V is clipped, although the run takes only {share:.2g} % of "
+        f"the rated power. Without clipping it would reach {small.unclipped_db:.1f} dB with 1.5 W into 8 ohm."
+    )
+    noise = "If the data sheet states watts of noise, give noise_watt; if "
+    assert small.advice[1] == f"{noise}the amplifier clips at a higher voltage, give peak_volts."
+    (ceilings, *_) = _tables(small)
+    assert [row[2] for row in ceilings.rows] == ["", "", "", "", "", "limits", ""]
+    assert ceilings.rows[4][1] == f"{small.unclipped_db:.1f} dB"
+    page = small.write(tmp_path).read_text(encoding="utf-8")
+    assert "peaks up to 4.9 V" in page
+    assert page.count("The bound knows the mean power and not the clipping") == 2  # its caption, for eye and ear
+    other = on(rating=AmplifierRating(8.0, sine_watt=1.5, peak_volts=20.0, volts_per_unit=4.0), want_db=14.0)
+    assert other.noise_reduction_db == pytest.approx(small.unclipped_db, abs=0.01)
+    assert other.enough
+    low = on(rating=AmplifierRating(8.0, sine_watt=1.5, peak_volts=4.0, volts_per_unit=4.0), want_db=14.0)
+    assert low.advice[1] == "If the amplifier clips at a higher voltage, give peak_volts."
+    assert on(rating=AmplifierRating(ohm=8.0, sine_watt=16.0, volts_per_unit=4.0), want_db=14.0).enough
+
+
+def test_the_cause_is_the_amplifier_if_only_a_filter_that_is_fixed_does_with_its_mean_power():
+    verdict = on(rating=0.6, want_db=12.0)
+    assert verdict.ceilings.power_db >= 12.0 > verdict.noise_reduction_db
+    assert (verdict.limited_by, verdict.unclipped_db) == ("amplifier", None)  # nothing clips
+    assert verdict.reason == (
+        f"The amplifier limits: with a rated power of 0.6 a fixed filter reaches {verdict.bound_db:.1f} dB, but the run, "
+        f"which keeps the rated power in each window of 0.1 s, only {verdict.noise_reduction_db:.1f} dB."
+    )
+    assert [row[2] for row in next(_tables(verdict)).rows] == ["", "", "", "", "limits", ""]
+
+
+@pytest.mark.parametrize(
+    ("missed", "told"),
+    [
+        (-0.04, "Not enough: .* just short of the 6 dB wanted"),
+        (0.04, "Enough: .* just enough for the 6 dB wanted"),
+        (-0.06, "Not enough: .* 0.1 dB less than the 6 dB wanted"),
+        (0.06, "Enough: .* 0.1 dB more than the 6 dB wanted"),
+    ],
+)
+def test_a_verdict_that_is_close_says_so(missed, told):
+    close = replace(verdict_on("amplifier", better=True), noise_reduction_db=6.0 + missed, enough=missed > 0)
+    assert re.match(told, close.verdict)
 
 
 def test_a_filter_that_ends_before_the_noise_arrives_is_advised_how_long_it_must_be():

@@ -192,7 +192,7 @@ def test_json_and_page_have_the_loudspeakers_and_the_microphones(tmp_path):
     before = data["levels"]["before_dba"]
     powers = [np.mean(d[d.size // 2 :] ** 2) for d in verdict.runs["KF-PB"].disturbance]
     assert before[1] - before[0] == pytest.approx(20 * np.log10(2) + 10 * np.log10(powers[1] / powers[0]), abs=0.1)
-    assert "2 W each into 8, 4 ohm" in data["verdict"]
+    assert "2 W each into 8 and 4 ohm" in data["verdict"]
     text = page.read_text(encoding="utf-8")
     assert "Are the amplifiers enough?" in text
     assert text.count('role="group"') == 2  # a player for each microphone
