@@ -252,6 +252,11 @@ def _rating(own: argparse.Namespace) -> list[Any]:
             raise ValueError("a loudspeaker's rating needs --ohm, its nominal impedance")
         ratings.append(LoudspeakerRating(own.ohm, noise_watt=own.loudspeaker_watt, volts_per_unit=own.volts_per_unit))
         used |= {"loudspeaker_watt", "ohm", "volts_per_unit"}
+    if "volts_per_unit" in used and own.volts_per_unit is None:
+        raise ValueError(
+            "watts and volts need --volts-per-unit, the volts at the loudspeaker for a control signal of 1: give what the "
+            "secondary path was measured with, or --rated-power in place of watts"
+        )
     if not ratings:
         raise ValueError("a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6")
     refuse_unused(

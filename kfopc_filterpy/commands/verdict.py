@@ -17,14 +17,14 @@ NOT_ENOUGH = 1
 
 EXAMPLES = """examples:
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --volts-per-unit 10 --want-db 6 -o out
-  kfopc verdict noise.wav --disturbance error.wav --secondary S.wav --watt 20 --ohm 8 --rating noise --json
+  kfopc verdict noise.wav --disturbance error.wav --secondary S.wav --rated-power 1.6 --json
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --fs 16000 --rated-power 1.6 --taps 256 --all
   kfopc verdict stereo.wav:0 --disturbance stereo.wav:1 --secondary paths.mat:S --rated-power 1.6
-  kfopc verdict ear.wav --feedback --secondary S.wav --watt 0.1 --ohm 32 --volts-per-unit 1.8
+  kfopc verdict ear.wav --feedback --secondary S.wav --watt 0.1 --ohm 32 --volts-per-unit 1.8 --rating noise
   kfopc verdict outside.wav --disturbance ear.wav --feedback --secondary S.wav --watt 0.1 --ohm 32 --volts-per-unit 1.8
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --amplifiers list.csv --volts-per-unit 10
   cat noise.wav | kfopc verdict - --primary P.wav --secondary S.wav --rated-power 1.6
-  kfopc verdict noise.wav --disturbance errors.wav --secondary S1.wav --secondary S2.wav --watt 20 --watt 10 --ohm 8
+  kfopc verdict noise.wav --disturbance errors.wav --secondary S1.wav --secondary S2.wav --rated-power 2 --rated-power 1
 
 several channels: those of the noise are the references, those of the disturbance the microphones. Each --secondary is one
 loudspeaker and each --primary one reference; the channels of these files are the microphones. If each file has one

@@ -26,6 +26,7 @@ def folder(tmp_path_factory):
     write_wav(here / "silent.wav", np.zeros(64), FS)
     write_wav(here / "short.wav", signals["d"][:20000], FS)
     (here / "empty.wav").write_bytes(b"")
+    (here / "list.csv").write_text("name,watt,ohm,price\nSmall,1,8,20\n")
     (here / "text.wav").write_text("these are words")
     np.save(here / "untimed.npy", secondary)
     return here

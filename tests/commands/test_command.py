@@ -30,6 +30,9 @@ ERRORS = {
     "verdict noise.wav PATHS --watt 20 --ohm 8 --rated-power 1": "leave out one of them",
     "verdict noise.wav PATHS --watt twenty --ohm 8": "--watt must be a single number in W, got 'twenty'",
     "verdict noise.wav PATHS --watt -20 --ohm 8": "--watt must be greater than 0 W, got -20; see kfopc verdict --help",
+    "verdict noise.wav PATHS --watt 20 --ohm 8": "watts and volts need --volts-per-unit, the volts at the loudspeaker",
+    "verdict noise.wav PATHS --amplifiers list.csv": "watts and volts need --volts-per-unit",
+    "verdict noise.wav PATHS --loudspeaker-watt 1 --ohm 8": "watts and volts need --volts-per-unit",
     "verdict noise.wav PATHS --loudspeaker-watt 1": "a loudspeaker's rating needs --ohm",
     "verdict noise.wav PATHS --rated-power 1 --ohm -1": "--ohm must be greater than 0",
     # The option that an argument of the package comes from is named.

@@ -113,9 +113,17 @@ def test_of_a_list_of_amplifiers_the_cheapest_that_is_enough_is_first(command, f
 @pytest.mark.parametrize(
     ("text", "more", "message"),
     [
-        ("name,watt,price\na,1,1\n", [], "list.csv must have the headings name, watt, ohm, price, and a number"),
-        ("name,watt,ohm,price\na,1,8,?\n", [], "each line: could not convert string to float: '?'"),
-        ("name,watt,ohm,price\na,1,8,nan\n", [], "each line: price must be finite, got nan"),
+        (
+            "name,watt,ohm\nA,ten,8\n",
+            [],
+            "list.csv has no column 'price': its first line must have the headings name, watt, ohm, price\n",
+        ),
+        ("\n", [], "list.csv has no column 'name'"),
+        ("name,watt,ohm,price\nA,ten,8,50\n", [], "list.csv, line 2: watt is 'ten', not a number\n"),
+        ("name,watt,ohm,price\nB,1,8,5\n\nA,1,8,nan\n", [], "list.csv, line 4: price must be finite, got nan"),
+        ("name,watt,ohm,price\nA,-1,8,5\n", [], "list.csv, line 2: watt must be greater than 0, got -1"),
+        ("name,watt,ohm,price\nA,1,8\n", [], "list.csv, line 2 must have 4 cells, as the headings, got 3"),
+        ("name,watt,ohm,price\nA,1,5,8,9\n", [], "line 2 must have 4 cells, as the headings, got 5"),  # 1,5 W
         ("name,watt,ohm,price\n", [], "list.csv lists no amplifier"),
         (
             "name,watt,ohm,price\na,1,8,1\n",
@@ -189,7 +197,7 @@ def test_a_second_measurement_of_the_path_may_tell_how_well_it_is_known(command,
 
 
 def test_the_rating_of_a_loudspeaker_counts_beside_that_of_the_amplifier(command):
-    rating = ["--watt", 100, "--ohm", 8, "--loudspeaker-watt", 0.8]
+    rating = ["--watt", 100, "--ohm", 8, "--loudspeaker-watt", 0.8, "--volts-per-unit", 1]
     out = command("verdict", *SCENE, *rating, "--taps", 16, "--json", "--algorithm", "FxLMS")[1]
     found = json.loads(out)["rating"]
     assert found["rated_power"] == pytest.approx(6.4)
