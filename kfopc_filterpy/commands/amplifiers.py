@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._validate import as_number
+from .._validate import as_number, as_positive
 from .inputs import ratings_of
 from .options import refuse_unused
 
@@ -28,19 +28,33 @@ def amplifiers_in(path: str) -> list[list[Any]]:
     require_file(path)
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-        comma = "," if ";" in lines[0] else "."  # of decimals
-        rows = [
-            [cell.strip() for cell in row] for row in csv.reader(lines, delimiter=";" if comma == "," else ",") if row
-        ]
-        places = [next(i for i, one in enumerate(rows[0]) if one.lower().startswith(column)) for column in COLUMNS]
-        found = [
-            [row[places[0]], *(as_number(float(row[i].replace(comma, ".")), rows[0][i]) for i in places[1:])]
-            for row in rows[1:]
-        ]
-    except (StopIteration, IndexError, ValueError) as error:
-        raise ValueError(
-            f"{path} must have the headings {', '.join(COLUMNS)}, and a number in the last three of each line: {error}"
-        ) from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not text: save the list as CSV in UTF-8") from error
+    decimal, delimiter = (",", ";") if ";" in lines[0] else (".", ",")
+    rows = csv.reader(lines, delimiter=delimiter)
+    headings, places = [cell.strip().lower() for cell in next(rows)], []
+    for column in COLUMNS:
+        if not (there := [i for i, heading in enumerate(headings) if heading.startswith(column)]):
+            raise ValueError(
+                f"{path} has no column {column!r}: its first line must have the headings {', '.join(COLUMNS)}"
+            )
+        places.append(there[0])
+
+    def amplifier(row: list[str]) -> list[Any]:
+        where = f"{path}, line {rows.line_num}"
+        if len(row) != len(headings):
+            raise ValueError(f"{where} must have {len(headings)} cells, as the headings, got {len(row)}")
+        name, *cells = (row[place].strip() for place in places)
+        numbers = []
+        for column, cell in zip(COLUMNS[1:], cells, strict=True):
+            try:
+                number = float(cell.replace(decimal, "."))
+            except ValueError as error:
+                raise ValueError(f"{where}: {column} is {cell!r}, not a number") from error
+            numbers.append((as_number if column == "price" else as_positive)(number, f"{where}: {column}"))
+        return [name, *numbers]
+
+    found = [amplifier(row) for row in rows if row]
     if not found:
         raise ValueError(f"{path} lists no amplifier below its headings")
     return sorted(found, key=lambda one: one[3])
