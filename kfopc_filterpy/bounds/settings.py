@@ -288,8 +288,8 @@ def _why_length(errors: np.ndarray, taps: int, d_power: float, n_taps: int | Non
     elif taps < errors.size:
         reason = f"{reached}, and a longer one of up to {errors.size} taps gains less than {GAIN_THAT_MATTERS_DB:g} dB"
     else:
-        limit = "max_taps allows" if errors.size == max_taps else "this record supports"
-        reason = f"as long as {limit}; {reached}, one of half the length by {reach(-(-taps // 2))}"
+        limit = "the longest that is tried" if errors.size == max_taps else "as long as this record supports"
+        reason = f"{limit}; {reached}, one of half the length by {reach(-(-taps // 2))}"
     if errors[taps - 1] > LITTLE * d_power:
         reason += "; if that is too little, the causality margin and the coherence tell the cause"
     return reason

@@ -90,7 +90,7 @@ def verdict(options: argparse.Namespace) -> int:
     from ..verdict.assessing import ALL
     from ..verdict.assessment import advice_on
     from ..verdict.candidates import CANDIDATES
-    from ..verdict.verdict_page import algorithms_table
+    from ..verdict.verdict_page import algorithms_table, settings_table
 
     if options.output is not None:
         import matplotlib
@@ -130,7 +130,7 @@ def verdict(options: argparse.Namespace) -> int:
         if table:
             origin["Amplifiers"] = "; ".join(f"{row[0]}: enough {row[-2]}, {row[-1]} dB to spare" for row in table.rows)
         found = replace(found, advice=tuple(advice), notes=(*found.notes, *files.remarks), origin=origin)
-    tables = ([table] if table else []) + ([algorithms_table(found)] if options.all else [])
+    tables = ([table] if table else []) + ([algorithms_table(found), settings_table(found)] if options.all else [])
     text = "\n".join([str(found), *(line for one in tables for line in ("", *one.lines))])
     print(found.json if options.json else text, flush=True)  # before the files are written
     for note in found.notes:

@@ -75,7 +75,7 @@ def plot_error_spectra(
     shown = curves(results)
     require_common_disturbance(shown)
     fs = shown[0].run.fs
-    scale, unit = np.ones(1), "1"
+    scale, unit = np.ones(1), "1 unit²"
     if pascal_per_unit is not None:
         pascals = per_channel(pascal_per_unit, len(np.atleast_2d(shown[0].run.error)), "microphones", "pascal_per_unit")
         scale, unit = pascals[:, np.newaxis] / SOUND_PRESSURE, "(20 µPa)²"

@@ -104,7 +104,7 @@ def frequency_axis(ax: Axes, frequencies: np.ndarray) -> Axes:
 
 
 def plain_log(axis: Axis) -> None:
-    """Write the ticks of a logarithmic axis of powers out: 0.1, 1, 10, 100."""
+    """Write the ticks of a logarithmic axis out: 0.1, 1, 10, 100."""
     from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
     axis.set_major_formatter(StrMethodFormatter("{x:g}"))

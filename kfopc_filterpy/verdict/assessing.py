@@ -47,7 +47,7 @@ from kfopc_filterpy.plant import Plant, as_constant_plant, checked_signals, requ
 from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_remarks
 
 from .._types import ProgressBar
-from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on, nominal_hz
+from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on, nominal_hz, percent
 from .candidates import CANDIDATES, CHOSEN, DIRECT, ONE_CHANNEL, Settings
 from .fixed_filters import FixedFilters, longest_filter
 from .limits import Limits, Ratings, limits_of, ratings_of_each, scale_of, watt_per_power
@@ -113,7 +113,7 @@ def assess(
     algorithm : str, default "KF-PB"
         Controller that the verdict is on. It has a limiter, which keeps the rating in every window.
     beside : sequence of str or "all", optional
-        Algorithms to run beside it, without a limiter, as published; by default KF-PB, KF-OPC and FxLMS. Each runs with
+        Algorithms to run beside it, without a limiter; by default KF-PB, KF-OPC and FxLMS. Each runs with
         the best of the settings that are tried on the first 5 s: step sizes, state noises or forgetting factors. With
         several channels KF-OPC and KF-ANC run only if they are named, or if all control filters together have at most
         256 taps, because their cost grows with the square of them.
@@ -443,8 +443,8 @@ def _on_uncertain_path(loop: FeedbackMargin | None, s: np.ndarray, uncertainty: 
     if error[worst] < tolerated[worst]:
         return []
     return [
-        f"The secondary path may be wrong by {error[worst]:.0%} at {frequencies[worst]:.0f} Hz, where the settled loop "
-        f"tolerates {tolerated[worst]:.0%}: measure the path again as it is in use, and state both measurements."
+        f"The secondary path may be wrong by {percent(error[worst])} at {frequencies[worst]:.0f} Hz, where the settled "
+        f"loop tolerates {percent(tolerated[worst])}: measure the path again as it is in use, and state both measurements."
     ]
 
 
@@ -494,7 +494,7 @@ def _on_better_runs(figures: Mapping[str, Mapping[str, Any]], algorithm: str) ->
             else f", but does not keep the rating: its mean power is {mean:.2g} times the rated power, and {worst:.2g} times "
             "in its worst window."
         )
-        notes.setdefault(worst <= KEPT, f"{name}, as published, reaches {reached:.1f} dB{why}")
+        notes.setdefault(worst <= KEPT, f"{name}, without a limiter, reaches {reached:.1f} dB{why}")
     return list(notes.values())
 
 
@@ -511,11 +511,12 @@ def _on_louder_bands(run: SimulationResult) -> list[str]:
     if not louder:
         return []
     each = zip(map(nominal_hz, centres), more, share.max(axis=0), strict=True)
-    named = [f"{centre} Hz by {db:.1f} dB ({own:.1%})" for centre, db, own in each]
+    named = [f"{centre} Hz by {db:.1f} dB, which carries {percent(own, '.1f')}" for centre, db, own in each]
+    named[louder[0]] += " of the A-weighted noise that remains"
     first = (named[band] for band in louder[:MOST_BANDS])
     return [
-        f"{run.algorithm} makes {len(louder)} of {more.size} third octaves louder: {', '.join(first)}"
-        f"{' and others' if len(louder) > MOST_BANDS else ''}; in brackets, their share of the A-weighted power that remains."
+        f"{run.algorithm} makes {len(louder)} of {more.size} third octaves louder: {'; '.join(first)}"
+        f"{'; and others' if len(louder) > MOST_BANDS else ''}."
     ]
 
 

@@ -283,7 +283,7 @@ class Assessment:
             return ""
         loop = self.loop
         return (
-            f"The settled loop tolerates a secondary path that is wrong by {loop.path_error:.0%} (least at "
+            f"The settled loop tolerates a secondary path that is wrong by {percent(loop.path_error)} (least at "
             f"{loop.path_error_hz:.0f} Hz); its gain may change by {loop.gain_margin_db:.1f} dB or its phase by "
             f"{loop.phase_margin_deg:.0f} degrees."
         )
@@ -371,6 +371,11 @@ def nominal_hz(centre: float) -> str:
     return f"{digits * 10 ** np.floor(np.log10(centre) + 1e-6):g}"
 
 
+def percent(share: float, form: str = ".0f") -> str:
+    """Return a share as text."""
+    return f"{100 * share:{form}} %"
+
+
 def _db(value: float) -> str:
     """Return a level as text, without a minus sign before zero."""
     return f"{round(value, 1) + 0.0:.1f} dB"
@@ -446,7 +451,7 @@ def advice_on(
         advice.append(f"{noise} the amplifier clips at a higher voltage, give {peak_volts}.")
     if verdict.band.weak_share > 0.1:
         advice.append(
-            f"{verdict.band.weak_share:.0%} of the noise lies where the loudspeaker is weak: a loudspeaker for "
+            f"{percent(verdict.band.weak_share)} of the noise lies where the loudspeaker is weak: a loudspeaker for "
             f"{verdict.band.low_hz:.0f} to {verdict.band.high_hz:.0f} Hz takes less power."
         )
     return advice

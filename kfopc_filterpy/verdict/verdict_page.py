@@ -17,7 +17,7 @@ from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_
 from kfopc_filterpy.plot.style import new_axes, plain_log
 
 from .._writing import write_whole
-from .assessment import nominal_hz
+from .assessment import nominal_hz, percent
 from .items import FigureItem, Sound, Table, write_files
 from .page import images, players, rendered
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 TEMPLATE = Path(__file__).with_name("verdict.html.jinja")
 NAME = "verdict"  # that the files beside the page begin with
 SINCE_SWITCH_ON = "Time since switch-on (s)"
+LOWEST_HZ = 20.0  # of the spectra, unless the noise is lower
 SWITCHED_ON = "The control is switched on {:g} s into the recording."
 CHAIN = (  # what each ceiling may use, and the cause if it is too low
     ("coherence_db", "Everything that the reference explains of the disturbance", "coherence"),
@@ -88,6 +89,8 @@ def _run_figures(verdict: Assessment) -> Iterator[FigureItem]:
     begin = SWITCHED_ON.format(verdict.switch_on_s)
     together = "" if verdict.channels is None else " All microphones together."
     ax: Any = plot_error_spectra(runs, pascal_per_unit=verdict.pascal_per_unit)
+    ax.set(xscale="log", xlim=(min(LOWEST_HZ, verdict.band.low_hz / 2), verdict.fs / 2))
+    plain_log(ax.xaxis)
     caption = f"Spectra without control and of the errors, over the steady half.{together}"
     yield FigureItem("spectra", caption, ax.figure)
     ax = plot_nse(runs)
@@ -205,6 +208,8 @@ def _tables(verdict: Assessment) -> Any:
     rows.append(["Wanted", f"{verdict.want_db:.1f} dB", ""])
     yield Table("ceilings", "What limits", ["Ceiling", "Noise reduction", ""], rows)
     yield algorithms_table(verdict)
+    if (settings := settings_table(verdict)).rows:
+        yield settings
     if verdict.channels is not None:
         yield Table(
             "microphones",
@@ -228,7 +233,7 @@ def _tables(verdict: Assessment) -> Any:
 
 
 def algorithms_table(verdict: Assessment) -> Table:
-    """Return the figures of merit of each run, and its settings."""
+    """Return the figures of merit of each run."""
     volts = verdict.volts_per_unit
     columns = [
         ("Noise reduction (dB)", "noise_reduction_db", None),
@@ -237,15 +242,23 @@ def algorithms_table(verdict: Assessment) -> Table:
         ("Power / rated power", "of_rated_power", None),
         ("Worst window", "worst_window", None),
         ("Highest peak" if volts is None else "Highest peak (V)", "peak_control_signal", volts),
-        ("Converged (s)", "convergence_time_s", None),
     ]
     rows: list[list[str | float]] = []
     for name, own in verdict.figures.items():
-        label = name if name == verdict.algorithm else f"{name}, as published"
-        settings = ", ".join(f"{key}={value:.6g}" for key, value in own["settings"].items())
-        rows.append([label, *(_number(own[key], scale) for _, key, scale in columns), settings])
-    headings = ["Controller", *(heading for heading, *_ in columns), "Settings"]
+        limiter = "yes" if name == verdict.algorithm else "no"
+        rows.append([name, limiter, *(_number(own[key], scale) for _, key, scale in columns)])
+    headings = ["Controller", "Limiter", *(heading for heading, *_ in columns)]
     return Table("algorithms", "The controllers", headings, rows)
+
+
+def settings_table(verdict: Assessment) -> Table:
+    """Return the settings with which each controller ran that has any."""
+    rows = [
+        [name, ", ".join(f"{key}={value:.6g}" for key, value in own["settings"].items())]
+        for name, own in verdict.figures.items()
+        if own["settings"]
+    ]
+    return Table("settings", "Settings of the controllers", ["Controller", "Settings"], rows)
 
 
 def _number(value: Any, scale: Any = None) -> Any:
@@ -278,12 +291,12 @@ def _checks(verdict: Assessment) -> dict[str, str]:
         "Rating": f"{verdict.power(limits.rated_power)}, decided by the {', '.join(decided)}; "
         f"{f'peaks up to {verdict.peak}' if limits.has_peaks else 'no peak limit'}; "
         f"windows of {limits.window_s:g} s",
-        "Power for full control": verdict.power(verdict.unlimited_power),
+        "Power of the best fixed filter, without a limit": verdict.power(verdict.unlimited_power),
         f"{least}, best fixed filter": _or_none(verdict, verdict.required_rated_power),
         f"{least}, {verdict.algorithm}, found by runs": _or_none(verdict, verdict.least_rated_power),
         "Causality": causality,
         "Band of the noise": f"90 % of its power from {band.low_hz:.0f} to {band.high_hz:.0f} Hz; "
-        f"{band.weak_share:.1%} where the loudspeaker is 20 dB weaker than its mean there",
+        f"{percent(band.weak_share, '.1f')} where the loudspeaker is 20 dB weaker than its mean there",
     }
     if verdict.stability:
         checks["Stability"] = verdict.stability

@@ -171,7 +171,7 @@ def test_it_says_why():
     late = np.convolve(bursts, np.eye(30)[25])[: bursts.size] + 0.01 * other
     plain = {"gains less than 0.1 dB": "n_taps"}
     cases = [
-        ((x, d), {"max_taps": 32}, {"as long as max_taps allows": "n_taps"}),
+        ((x, d), {"max_taps": 32}, {"the longest that is tried; the best fixed filter": "n_taps"}),
         ((x[:400], d[:400]), {}, {"as long as this record supports": "n_taps"}),
         ((x, d), {"n_taps": 64}, {"as given": "n_taps"}),
         ((X, other), {}, {"causality margin and the coherence tell the cause": "n_taps", "by 0.0 dB": "n_taps"}),

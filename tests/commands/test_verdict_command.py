@@ -151,10 +151,15 @@ def test_a_verdict_names_options_in_its_advice_and_on_its_page(command, tmp_path
 
 def test_all_algorithms_are_printed_as_a_table(command, folder):
     code, out, _ = command("verdict", *SCENE, "--rated-power", "4", "--taps", "8", "--all")
-    verdict, table = out.split("\n\n")
+    verdict, table, settings = out.split("\n\n")
     assert verdict.startswith("Enough" if code == 0 else "Not enough")
-    names = [line.split(", as published")[0].split("  ")[0] for line in table.splitlines()]
+    names = [line.split("  ")[0] for line in table.splitlines()]
     assert names == ["Controller", *CANDIDATES]
+    assert re.findall(r" (yes|no) ", table) == ["yes"] + ["no"] * (len(CANDIDATES) - 1)  # a limiter
+    assert [line.split("  ")[0] for line in settings.splitlines()] == [
+        "Controller",
+        *[*CANDIDATES][1:],
+    ]  # KF-PB has none
 
 
 def test_a_verdict_notes_a_short_or_clipped_recording_in_terminal_and_json(command, folder):

@@ -72,7 +72,7 @@ def require_nse(ax, label, e, d, *window_s, **options):
 def test_error_spectra_hold_the_disturbance_and_each_error(tonal):
     ax = plotting.plot_error_spectra(list(tonal.values()), band=(100.0, 5000.0), segment_s=0.05)
     assert _labels(ax) == ["Disturbance", *tonal]
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Power per Hz (dB re 1/Hz)")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Power per Hz (dB re 1 unit²/Hz)")
     assert ax.get_xlim() == (100.0, 5000.0)
     for name, run in tonal.items():
         f, level = power_spectrum_db(run.error, FS, segment_s=0.05)

@@ -12,7 +12,7 @@ from kfopc_filterpy.signals import band_limited_noise
 from kfopc_filterpy.verdict import assess
 from kfopc_filterpy.verdict.candidates import CANDIDATES, ONE_CHANNEL
 from kfopc_filterpy.verdict.runs import Plan
-from kfopc_filterpy.verdict.verdict_page import algorithms_table
+from kfopc_filterpy.verdict.verdict_page import settings_table
 
 FS, TAPS = 8000, 16
 NOISE = band_limited_noise((100, 1500), 3.0, fs=FS, rng=1, power=1.0)
@@ -58,7 +58,7 @@ def test_the_settings_that_ran_are_told(verdict):
     again = simulate(own, NOISE - NOISE.mean(), Plant(SECONDARY, fs=FS), disturbance=d, switch_on_s=0.3)
     reached = noise_reduction_db(again.error, again.disturbance)
     assert verdict.figures["FxNLMS"]["noise_reduction_db"] == pytest.approx(reached, abs=0.01)  # offsets are subtracted
-    assert f"step_size={settings['step_size']:.6g}, regularization=" in "\n".join(algorithms_table(verdict).lines)
+    assert f"step_size={settings['step_size']:.6g}, regularization=" in "\n".join(settings_table(verdict).lines)
 
 
 def test_with_several_channels_those_of_one_channel_and_the_slow_ones_are_left_out():
