@@ -261,7 +261,8 @@ def _longest(n_samples: int, n_path: int, n_taps: int | None, max_taps: int, cro
         needed = n_path - 2 + per_tap * wanted
         raise ValueError(
             f"reference must have at least {needed} samples for {wanted} control and {n_path} path taps, got {n_samples}; "
-            f"record a longer silent run{', or cut the impulse response' if 2 * n_path > n_samples else ''}"
+            f"{f'choose at most {supported} control taps, or ' if supported > 0 else ''}record a longer silent run"
+            f"{', or cut the impulse response' if 2 * n_path > n_samples else ''}"
         )
     return min(max_taps, supported) if n_taps is None else wanted
 

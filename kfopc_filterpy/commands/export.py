@@ -50,15 +50,25 @@ def export(options: argparse.Namespace) -> int:
     """Write the files and print where they are."""
     from ..checkpoint import Checkpointed
     from ..export import export_c, export_fmu
+    from ..signals.recordings import AUDIO_FILES
 
     path, fs = Path(options.controller), options.fs
     if path.suffix == ".toml":
         controller, fs = described(path, options)
+    elif path.suffix.lower() in AUDIO_FILES:
+        raise ValueError(
+            f"{path} is a sound file: give a settings file, *.toml, that names it as its secondary path, or a controller "
+            "that Python saved"
+        )
     else:
         controller = Checkpointed.load(path)
     folder = Path(options.output)
     if not options.fmu:
-        print(f"{export_c(controller, folder, name=options.name, dtype=options.dtype)} in {folder}")
+        made = export_c(controller, folder, name=options.name, dtype=options.dtype)
+        print(
+            f"{made.path} and {made.header_path.name}: {made.algorithm}, {made.n_taps} taps, {made.dtype}, state of "
+            f"{made.n_bytes:,} bytes"
+        )
         return DONE
     if not fs:
         raise ValueError("an FMU needs the sample rate: give --fs, or fs in the settings file")

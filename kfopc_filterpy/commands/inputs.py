@@ -186,7 +186,7 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[np.ndarray, Pla
                 f"{options.disturbance} has {disturbance.shape[-1]} samples, {options.noise} {noise.shape[-1]}: they must be "
                 "recorded together and be equally long; cut both to the same start and the same end"
             )
-        require_different(options.disturbance, disturbance, options.noise, noise)
+        require_different(f"--disturbance {options.disturbance}", disturbance, options.noise, noise)
         require_each_microphone(options.disturbance, disturbance, len(secondary), "--secondary")
     return noise, Plant(secondary, primary, fs=files.fs), disturbance
 

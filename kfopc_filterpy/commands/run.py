@@ -18,7 +18,7 @@ from .options import DONE, Parser, add_command, add_count, add_number, add_scene
 from .printing import warn
 
 if TYPE_CHECKING:
-    from ..realtime import Health, Interface, RunReport, RunStatus, SimulatedInterface
+    from ..realtime import Interface, RunReport, RunStatus, SimulatedInterface
 
 FAULT = 1
 LATEST = 10  # events that the summary shows
@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
         return FAULT
     if show is not None and sys.stderr.isatty():
         print(file=sys.stderr)  # the line of the status ends
-    print(_facts(report) if options.json else summarize(report, interface.fs, interface.block))
+    print(_facts(report) if options.json else summarize(report, interface.fs, interface.block, options.seconds))
     return FAULT if report.stopped_by.startswith("fault") else DONE
 
 
@@ -194,16 +194,16 @@ def _screen(stream: TextIO) -> Callable[[RunStatus], None]:
 def describe(status: RunStatus) -> str:
     """Return the status of a run as a line of text."""
     reductions = " ".join(f"{r:5.1f}" for r in status.reduction_db)
-    health = _counted(status.health) or "healthy"
     return (
         f"{status.seconds:7.1f} s  reduction {reductions} dB  power {_powers(status)}  load {100 * status.load:.0f} %  "
-        f"overruns {status.overruns}  {health}"
+        f"{_noticed(status) or 'healthy'}"
     )
 
 
-def _counted(health: Health) -> str:
-    """Return how often each kind of event was noticed, empty if nothing was."""
-    return ", ".join(f"{n} {what}" for what, n in health.counts.items())
+def _noticed(status: RunStatus) -> str:
+    """Return how many blocks took too long, and how often each kind of event was noticed; empty if nothing was."""
+    late = {"block(s) too slow": status.overruns} if status.overruns else {}
+    return ", ".join(f"{n} {what}" for what, n in (late | status.health.counts).items())
 
 
 def _powers(report: RunStatus | RunReport, of: str = "") -> str:
@@ -221,13 +221,19 @@ def _facts(report: RunReport) -> str:
     return json.dumps(jsonable(facts | {"health": [vars(event) for event in report.health.events]}), indent=2)
 
 
-def summarize(report: RunReport, fs: float, block: int) -> str:
-    """Return a report as text."""
-    lines = [f"{report.seconds:.1f} s under control, stopped by {report.stopped_by}"]
+def summarize(report: RunReport, fs: float, block: int, asked_s: float | None = None) -> str:
+    """Return a report as text; `asked_s` are the seconds of control that were asked for."""
+    end = f"stopped by {report.stopped_by}"
+    if report.stopped_by == "end":
+        end = "as asked for" if asked_s is not None and report.seconds >= asked_s else "ended with the recording"
+    lines = [f"{report.seconds:.1f} s under control, {end}"]
     if report.round_trip_samples is not None:
         lines.append(f"round trip {report.round_trip_samples} samples, {1e3 * report.round_trip_samples / fs:.1f} ms")
     if np.isfinite(report.possible_db):
-        reach = f"in the silence before, the best fixed filter without a rated power would reach {report.possible_db:.1f} dB"
+        reach = (
+            f"in the silence before, the best fixed filter without a rated power would reach {report.possible_db:.1f} dB, and "
+            "one that adapts perhaps more"
+        )
         if report.possible_db < SMALL_BOUND_DB and block > 1:
             reach += (
                 f"; if the anti-noise comes too late, use a smaller --block: two blocks of {block} samples are "
@@ -241,7 +247,7 @@ def summarize(report: RunReport, fs: float, block: int) -> str:
         f"output power {_powers(report, ' of the rated power')}",
         f"{report.overruns} of {report.blocks} blocks took longer than their duration, the longest {100 * report.load:.0f} % "
         f"of it; {report.lost} samples lost, {report.underflows} blocks too late for the output",
-        f"health: {_counted(report.health) or 'nothing noticed'}",
+        f"health: {_noticed(report) or 'nothing noticed'}",
         *(f"  {fault}" for fault in faults[-LATEST:]),
     ]
     return "\n".join(lines)

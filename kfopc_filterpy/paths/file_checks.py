@@ -9,6 +9,10 @@ def require_different(disturbance: str, heard: np.ndarray, noise: str, reference
     """Raise ValueError if a channel of the disturbance, (n_channels, n_samples), is one of the noise."""
     for k, i in np.ndindex(len(heard), len(reference)):
         if np.array_equal(heard[k], reference[i]):
+            if len(heard) == len(reference) == 1:
+                raise ValueError(
+                    f"{noise} and {disturbance} are the same signal: give the error microphone's recording"
+                )
             raise ValueError(
                 f"channel {k} of {disturbance} is channel {i} of {noise}, sample for sample: is it the error microphone? "
                 "Name its channel, as in recording.wav:1"

@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-SHORT_S = 5.0
+SHORT_S, RECOMMENDED_S = 5.0, 10.0
 CLIPPED_SHARE = 1e-4  # of the samples; fewer hardly matter
 STEPS = 2.0  # smallest steps of the numbers: what clips comes from further away
 
 
 def recording_remarks(samples: ArrayLike, fs: float, name: str) -> list[str]:
-    """Return remarks on a recording, (n_samples,) or (n_channels, n_samples): that it is short, or clipped."""
+    """Return remarks on a recording, (n_samples,) or (n_channels, n_samples): that it is short, clipped, or twice the same."""
     channels = np.atleast_2d(samples)
     remarks = clipping_remarks(channels, name)
     seconds = channels.shape[-1] / fs
     if seconds < SHORT_S:
         remarks.append(
-            f"{name} lasts only {seconds:.3g} s, so a part of the result may be chance: record at least {SHORT_S:g} s."
+            f"{name} lasts only {seconds:.3g} s, so a part of the result may be chance: record {RECOMMENDED_S:g} s or more."
         )
+    remarks += [
+        f"{name}, channels {i} and {k}, are the same signal: leave one of them out."
+        for i, k in combinations(range(len(channels)), 2)
+        if np.array_equal(channels[i], channels[k])
+    ]
     return remarks
 
 

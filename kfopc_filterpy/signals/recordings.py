@@ -56,11 +56,11 @@ class _Format(NamedTuple):
     holds_arrays: bool = False  # whose axes, and times among them, nothing names
 
 
-_AUDIO_FILES = (".wav", ".wave", ".bwf", ".rf64", ".flac", ".aif", ".aiff", ".aifc")
+AUDIO_FILES = (".wav", ".wave", ".bwf", ".rf64", ".flac", ".aif", ".aiff", ".aifc")
 _REFUSED_AUDIO = (".m4a", ".aac", ".mp3", ".ogg", ".oga", ".opus", ".wma", ".w64", ".caf", ".au")  # with the remedy
 _AUDIO_HEADS = (b"RIFF", b"RIFX", b"RF64", b"BW64", b"FORM", b"fLaC")
 _REFUSED_HEADS = (b"OggS", b"ID3", b"\xff\xfb", b"riff", b"caff", b".snd")
-_AUDIO = _Format("an audio file", read_audio, _AUDIO_FILES + _REFUSED_AUDIO, _AUDIO_HEADS + _REFUSED_HEADS)
+_AUDIO = _Format("an audio file", read_audio, AUDIO_FILES + _REFUSED_AUDIO, _AUDIO_HEADS + _REFUSED_HEADS)
 _MAT = _Format("a MAT file", read_mat, (".mat",), (b"MATLAB",), has_variables=True, holds_arrays=True)
 _TEXT = _Format("text", read_text, (".txt", ".csv", ".tsv", ".dat", ".asc", ".frd", ".zma"))
 _NPY = _Format("a .npy file", read_npy, (".npy",), (b"\x93NUMPY",), holds_arrays=True)
@@ -382,7 +382,9 @@ def as_channel(channel: int, samples: np.ndarray, name: object) -> int:
         raise ValueError(f"{name} holds a matrix of paths, {samples.shape}, and no channels: leave out channel")
     index = as_count(channel, "channel", minimum=0)
     if index >= len(samples):
-        raise ValueError(f"channel must be below the {len(samples)} channel(s) of {name}, got {index}")
+        last = len(samples) - 1
+        there = ("only channel 0", "channels 0 and 1", f"channels 0 to {last}")[min(last, 2)]
+        raise ValueError(f"{name} has {there} (counted from 0), but channel must be one of them, got {index}")
     return index
 
 

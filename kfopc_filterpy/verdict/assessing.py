@@ -44,7 +44,7 @@ from kfopc_filterpy.paths.file_checks import require_different, require_each_mic
 from kfopc_filterpy.paths.timing import timing_fault
 from kfopc_filterpy.paths.uncertainty import Uncertainty, as_uncertainty
 from kfopc_filterpy.plant import Plant, as_constant_plant, checked_signals, require_rate
-from kfopc_filterpy.signals.quality import SHORT_S, clipping_remarks, recording_remarks
+from kfopc_filterpy.signals.quality import RECOMMENDED_S, clipping_remarks, recording_remarks
 
 from .._types import ProgressBar
 from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on, nominal_hz, percent
@@ -203,7 +203,7 @@ def assess(
     if run_s < LEAST_RUN_S:
         raise ValueError(
             f"noise must last {LEAST_RUN_S:g} s after the control is switched on, got {run_s:.3g} s: a shorter run says "
-            f"nothing; record at least {SHORT_S:g} s"
+            f"nothing; record {RECOMMENDED_S:g} s or more"
         )
     notes: list[str] = []
     announce(bar, 0, "bounds")
@@ -231,8 +231,8 @@ def assess(
         if slow and weights > MOST_DIRECT_WEIGHTS:
             others = [name for name in others if name not in slow]
             notes.append(
-                f"{' and '.join(slow)} left out, because {weights} weights take long: choose one as the algorithm, or at "
-                f"most {MOST_DIRECT_WEIGHTS // (J * n_references)} taps."
+                f"{' and '.join(slow)} left out, because {weights} weights take long: choose {' or '.join(slow)} as the "
+                f"algorithm, or {MOST_DIRECT_WEIGHTS // (J * n_references)} taps or fewer."
             )
     names = [algorithm, *(name for name in others if name != algorithm)]
 

@@ -200,7 +200,10 @@ def test_it_says_why():
         ({"plant": Plant(np.zeros((2, 2, 4)), fs=FS)}, r"\(K microphones, n_samples\) = \(2, 32000\)"),
         ({"disturbance": None}, "the disturbance is unknown: make the plant with a primary path, or give disturbance="),
         ({"plant": PLANT.changed_at(1.0, secondary=-S)}, "suggest_settings needs a plant that does not change"),
-        ({"n_taps": 2909}, "at least 32001 samples for 2909 control and 4 path taps, got 32000; record"),
+        (
+            {"n_taps": 2909},
+            "at least 32001 samples for 2909 control and 4 path taps, got 32000; choose at most 2908 control",
+        ),
         ({"plant": Plant(np.ones(31995), fs=FS)}, "record a longer silent run, or cut the impulse response"),
         ({"reference": X[:12], "disturbance": D[:12]}, "at least 13 samples for 1 control"),
         ({"memory_s": -1.0}, "memory_s must be greater than 0"),

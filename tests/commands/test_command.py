@@ -23,6 +23,7 @@ PATHS = "--primary P.wav --secondary S.wav"
 ERRORS = {
     "verdict": "the following arguments are required: noise, --secondary; see kfopc verdict --help",
     "verdikt": "invalid choice",
+    "verdict noise.wav PATHS --rated-power 1 --tap 8": "unrecognized arguments: --tap 8; see kfopc verdict --help",
     "paths inspect S.wav --bogus 3": "unrecognized arguments: --bogus 3; see kfopc paths inspect",
     # Ratings.
     "verdict noise.wav PATHS": "a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6",
@@ -64,15 +65,18 @@ ERRORS = {
     # Channels.
     "verdict stereo.wav --secondary S.wav --rated-power 1": "name both, as in stereo.wav:0 --disturbance stereo.wav:1",
     "verdict stereo.wav PATHS --rated-power 1": "choose a channel, as in stereo.wav:0",
-    "verdict stereo.wav:2 PATHS --rated-power 1": "channel must be below the 2 channel(s) of stereo.wav, got 2",
-    "verdict noise.wav --secondary S.wav --rated-power 1 --disturbance stereo.wav:1": "is channel 0 of noise.wav",
+    "verdict stereo.wav:2 PATHS --rated-power 1": "stereo.wav has channels 0 and 1 (counted from 0), but",
+    "verdict noise.wav --secondary S.wav --rated-power 1 --disturbance stereo.wav:1": "noise.wav and --disturbance",
     "verdict stereo.wav --secondary S.wav --rated-power 1 --disturbance ./stereo.wav:1": "is channel 0 of stereo.wav",
     "paths identify noise.wav d.wav --taps 8 -o none/x.npy": "the folder none does not exist: make it first",
     "paths identify stereo.wav d.wav --taps 8 -o x.npy": "name one of stereo.wav:0 to stereo.wav:1",
-    "paths inspect S.wav:1": "channel must be below the 1 channel(s) of S.wav",
+    "paths inspect S.wav:1": "S.wav has only channel 0 (counted from 0), but channel must be one of them, got 1",
     "paths inspect S.wav:0:1": "S.wav:0:1 does not exist",
     "paths inspect S.wav:S": "S.wav is an audio file, which has no named variables",
-    "paths identify stereo.wav:0 stereo.wav:0 --taps 8 -o x.npy": "sample for sample: is it the error microphone?",
+    "paths identify stereo.wav:0 stereo.wav:0 --taps 8 -o x.npy": "stereo.wav:0 and stereo.wav:0 are the same signal: give",
+    "verdict noise.wav --secondary S.wav --rated-power 1 --disturbance noise.wav": "noise.wav and --disturbance noise.wav are "
+    "the same signal: give the error microphone's recording",
+    "export S.wav -o fw": "S.wav is a sound file: give a settings file, *.toml, that names it as its secondary path, or",
     # Several channels.
     "verdict noise.wav --primary P1.wav --secondary S1.wav --watt 1 --watt 2 --ohm 8 --fs 8000": "--watt must be given once",
     "verdict noise.wav --primary P11.wav --secondary S1.wav --rated-power 1 --fs 8000": "--primary must give a path from each",

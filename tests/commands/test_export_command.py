@@ -55,7 +55,8 @@ def test_an_algorithm_is_described_by_its_name_and_settings(name, command, folde
     (folder / "c.toml").write_text(described(algorithm=name, n_taps=8, secondary=path, **SETTINGS[name]))
     code, out, err = command("export", "c.toml", "-o", tmp_path / "out")
     assert (code, err) == (0, "")
-    assert out.startswith("<CExport anc.c: ")
+    made = tmp_path / "out" / "anc.c"
+    assert re.fullmatch(rf"{re.escape(str(made))} and anc.h: {name}, 8 taps, float64, state of [\d,]+ bytes\n", out)
     assert same_as_of_python(CORE[name](8, path, **SETTINGS[name]), tmp_path / "out", tmp_path)
 
 

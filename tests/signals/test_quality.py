@@ -48,5 +48,11 @@ def test_clipped_whole_numbers_are_noticed():
 def test_a_short_recording_is_noticed():
     (remark,) = recording_remarks(NOISE[: 3 * FS], FS, "noise")
     assert remark.startswith("noise lasts only 3 s")
-    assert "record at least 5 s" in remark
+    assert "record 10 s or more" in remark
     assert recording_remarks(NOISE[: 5 * FS], FS, "noise") == []
+
+
+def test_channels_that_are_the_same_signal_are_noticed():
+    long = np.tile(NOISE, 2)
+    (remark,) = recording_remarks([long, -long, long], FS, "noise")
+    assert remark == "noise, channels 0 and 2, are the same signal: leave one of them out."

@@ -362,7 +362,7 @@ def test_a_third_octave_that_the_control_makes_louder_is_noted():
         ({"noise": np.full(8000, np.nan)}, "noise must be finite"),
         ({"secondary": np.zeros(8)}, "secondary must not be silent: every value is 0; record it again"),
         ({"primary": None}, "plant must have a primary path unless there is a disturbance"),
-        ({"disturbance": noise()}, "channel 0 of disturbance is channel 0 of noise, sample for sample"),
+        ({"disturbance": noise()}, "noise and disturbance are the same signal: give the error microphone's recording"),
         ({"disturbance": np.ones(7)}, "disturbance must have 24000 values, got 7"),
         (
             {"noise": noise()[:16000].reshape(2, 8000)},
@@ -372,7 +372,10 @@ def test_a_third_octave_that_the_control_makes_louder_is_noted():
         ({"rating": 0.0}, "rating must be greater than 0"),
         ({"algorithm": "KF"}, "algorithm must be one of 'KF-PB', 'KF-OPC', 'FxLMS'"),
         ({"want_db": -1.0}, "want_db must not be negative"),
-        ({"noise": noise()[: 2 * FS]}, "noise must last 2 s after the control is switched on, got 1.8 s"),
+        (
+            {"noise": noise()[: 2 * FS]},
+            "after the control is switched on, got 1.8 s: a shorter run says nothing; record 10 s",
+        ),
         ({"n_taps": 12000}, "must have at least"),
         ({"pascal_per_unit": 0.0}, "pascal_per_unit must be greater than 0"),
     ],
