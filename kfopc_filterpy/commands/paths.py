@@ -19,6 +19,8 @@ from .printing import warn
 WRITTEN = (".wav", ".npy", ".csv", ".txt")
 UNRELATED, CHANCE = 0.02, 3.0  # a path must explain this share of a response, and this many times what chance explains
 POOR_DB = -20.0  # a warning is printed if more of the response is left unexplained
+EXCITED_DB = -40.0  # of the strongest part of an excitation's spectrum: below, a microphone mostly hears other noise
+LOWEST_HZ, NARROW = 20.0, 8.0  # an excited band is narrow below three octaves, as from 125 to 1000 Hz
 
 
 def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
@@ -49,7 +51,7 @@ def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
 
 
 def identify(options: argparse.Namespace) -> int:
-    """Fit an impulse response, write it and print what it leaves unexplained."""
+    """Fit an impulse response, write it and print what it leaves unexplained, and in which band it is known."""
     from ..paths import estimate_path
     from ..paths.file_checks import require_different
     from ..paths.timing import plays_once
@@ -64,8 +66,16 @@ def identify(options: argparse.Namespace) -> int:
             f"--taps must be at most {(shortest + 1) // 2} for recordings of {shortest} samples, got {options.taps}: "
             "identify a shorter impulse response, or record for longer"
         )
+    low_hz, high_hz = _excited_band(sent, files.fs)
     found = estimate_path(sent[:shortest], heard[:shortest], options.taps, files.fs)
     _judge_residual(options, found.residual_db, files.fs, sent[:shortest], heard[:shortest])
+    if high_hz < NARROW * max(low_hz, LOWEST_HZ):
+        warn(
+            options,
+            f"{options.excitation} excites the path from {low_hz:.0f} to {high_hz:.0f} Hz only: elsewhere the impulse response "
+            "is a guess, which no residual shows; play noise or a sweep over the whole band of the noise to be controlled, "
+            "and an octave beyond",
+        )
     if plays_once(sent):
         warn(
             options,
@@ -74,10 +84,24 @@ def identify(options: argparse.Namespace) -> int:
         )
     units = files.units[options.response], files.units[options.excitation]
     _write_path(options.output, found.taps, files.fs, "" if "1" in units or len(set(units)) == 1 else "/".join(units))
-    facts = {"n_taps": options.taps, "fs": files.fs, "residual_db": float(found.residual_db), "output": options.output}
-    text = f"{options.output}: {options.taps} taps, which leave {found.residual_db:.1f} dB of the response unexplained"
+    residual_db = float(found.residual_db)
+    facts = {"n_taps": options.taps, "fs": files.fs, "residual_db": residual_db, "output": options.output}
+    facts |= {"excited_low_hz": low_hz, "excited_high_hz": high_hz}
+    text = (
+        f"{options.output}: {options.taps} taps, which explain all but {100 * 10 ** (residual_db / 10):.1g} % of the response "
+        f"({residual_db:.1f} dB); excited from {low_hz:.0f} to {high_hz:.0f} Hz"
+    )
     print(json.dumps(facts) if options.json else text)
     return DONE
+
+
+def _excited_band(sent: np.ndarray, fs: float) -> tuple[float, float]:
+    """Return the lowest and the highest frequency in Hz at which an excitation has power."""
+    from scipy.signal import welch
+
+    frequencies, powers = welch(sent - sent.mean(), fs, nperseg=min(4096, sent.size), detrend=False)
+    excited = frequencies[powers >= 10 ** (EXCITED_DB / 10) * powers.max()]
+    return float(excited[0]), float(excited[-1])
 
 
 def _judge_residual(

@@ -31,6 +31,25 @@ def test_a_path_is_identified_from_a_recording(command, folder, tmp_path, suffix
     np.testing.assert_allclose(found.samples, taps, atol=1e-4)
 
 
+@pytest.mark.parametrize(("low", "high", "is_narrow"), [(300, 600, True), (20, 150, True), (100, 1500, False)])
+def test_the_band_in_which_a_path_is_known_is_told(command, folder, tmp_path, low, high, is_narrow):
+    sent = band_limited_noise((low, high), 4.0, fs=FS, rng=3)
+    heard = np.convolve(sent, np.eye(16)[5]) + 1e-3 * np.random.default_rng(4).standard_normal(sent.size + 15)
+    write_wav(folder / "sent.wav", sent, FS)
+    write_wav(folder / "received.wav", heard, FS)
+    fit = ["paths", "identify", "sent.wav", "received.wav", "--taps", 16, "-o", tmp_path / "S.wav"]
+    code, out, err = command(*fit)
+    assert code == 0
+    share, db, *edges = re.search(
+        r"all but (\S+) % of the response \((\S+) dB\); excited from (\d+) to (\d+) Hz", out
+    ).groups()
+    assert 10 * np.log10(float(share) / 100) == pytest.approx(float(db), abs=2.0)  # one digit
+    assert [int(edge) for edge in edges] == pytest.approx([low, high], abs=50)
+    assert (f"sent.wav excites the path from {edges[0]} to {edges[1]} Hz only: " in err) == is_narrow
+    facts = json.loads(command(*fit, "--json")[1])
+    assert [f"{facts[f'excited_{edge}_hz']:.0f}" for edge in ("low", "high")] == edges
+
+
 def test_files_that_a_path_does_not_explain_are_refused_and_nothing_is_written(command, folder, tmp_path):
     write_wav(folder / "other.wav", band_limited_noise((100, 1500), 3.0, fs=FS, rng=2), FS)
     code, out, err = command("paths", "identify", "noise.wav", "other.wav", "--taps", 24, "-o", tmp_path / "S.wav")

@@ -59,7 +59,7 @@ def test_the_readmes_verdict_runs_as_pasted_on_the_files_of_the_demo(inside, cap
     assert main(pasted[1:]) == 0
     assert Path(folder, "out", "verdict.html").is_file()
     printed = capsys.readouterr().out
-    assert re.search(r"^```text\n(.*?)^```$", text, flags=re.M | re.S)[1] in printed
+    assert printed.endswith("\n" + re.search(r"^```text\n(.*?)^```$", text, flags=re.M | re.S)[1])
     watt = re.search(r"About (\S+) W into 8 ohm would do", printed)[1]
     typed_back = (
         " ".join(pasted[1:-2])
