@@ -384,7 +384,7 @@ def as_channel(channel: int, samples: np.ndarray, name: object) -> int:
     if index >= len(samples):
         last = len(samples) - 1
         there = ("only channel 0", "channels 0 and 1", f"channels 0 to {last}")[min(last, 2)]
-        raise ValueError(f"{name} has {there} (counted from 0), but channel must be one of them, got {index}")
+        raise ValueError(f"{name} has {there} (counted from 0), got channel {index}")
     return index
 
 

@@ -226,7 +226,7 @@ def test_channels_lead_and_one_is_chosen(tmp_path):
     for channel in (0, 1):
         one = read_recording(tmp_path / "x.wav", channel=channel)
         np.testing.assert_array_equal(one.one_channel(), both.samples[channel])
-    with pytest.raises(ValueError, match=r"x\.wav has channels 0 and 1 \(counted from 0\), .*, got 2"):
+    with pytest.raises(ValueError, match=r"x\.wav has channels 0 and 1 \(counted from 0\), got channel 2"):
         read_recording(tmp_path / "x.wav", channel=2)
     with pytest.raises(ValueError, match="channel must be at least 0"):
         read_recording(tmp_path / "x.wav", channel=-1)
