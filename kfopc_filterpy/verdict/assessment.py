@@ -253,7 +253,10 @@ class Assessment:
         if cause == "amplifier" and self.ceilings.power_db >= self.want_db:
             cause = "peaks" if self.limited_by_peaks else "windows"
         ceilings = {name: "" if value is None else _db(value) for name, value in vars(self.ceilings).items()}
-        return _REASONS[cause].format(
+        text = _REASONS[cause]
+        if cause == "windows" and self.unclipped_db is not None:
+            text += " Without clipping it would reach {unclipped}."
+        return text.format(
             **ceilings,
             reached=_db(self.noise_reduction_db),
             taps=self.settings.n_taps,

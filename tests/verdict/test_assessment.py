@@ -132,6 +132,8 @@ def test_the_cause_is_the_amplifier_if_only_a_filter_that_is_fixed_does_with_its
         f"which keeps the rated power in each window of 0.1 s, only {verdict.noise_reduction_db:.1f} dB."
     )
     assert [row[2] for row in next(_tables(verdict)).rows] == ["", "", "", "", "limits", ""]
+    clipped = replace(verdict, unclipped_db=11.7)  # which is not enough, either
+    assert clipped.reason == f"{verdict.reason} Without clipping it would reach 11.7 dB."
 
 
 @pytest.mark.parametrize(
