@@ -12,7 +12,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from ._types import PathModel, PathModels, System
-from ._validate import as_count, as_positive, as_real_array, as_signal, require_finite
+from ._validate import as_count, as_positive, as_real_array, as_signal, require_finite, same_rate
 from .signals.recordings import Recording
 
 # Share of an impulse response's energy that may be cut off: -60 dB.
@@ -84,7 +84,7 @@ def sampling_rate(path: PathModel, fs: float | None = None, *, name: str = "path
             "set dt = 1/fs, or convert a continuous system with control.sample_system"
         )
     rate = 1 / float(path.dt)
-    if fs is not None and abs(rate - fs) > 1e-9 * fs:
+    if fs is not None and not same_rate(rate, fs):
         raise ValueError(f"{name} is sampled at {rate:g} Hz but fs is {fs:g} Hz; resample one (resample_path)")
     return rate if fs is None else fs
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import operator
+import os
 from collections.abc import Callable, Iterable
 from fractions import Fraction
 from importlib import import_module
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -42,15 +44,22 @@ def as_real_array(value: Any, name: str) -> np.ndarray:
             real = np.where(np.ma.getmaskarray(value), np.nan, real)  # a masked value is a missing one
     except (TypeError, ValueError) as error:
         ragged = ", whose rows differ in length" if "inhomogeneous" in str(error) else ""
-        raise TypeError(f"{name} must be a sequence of real numbers, got {type(value).__name__}{ragged}") from error
+        raise TypeError(f"{name} must be a sequence of real numbers, got {_kind_of(value)}{ragged}") from error
     except OverflowError as error:  # an integer of Python
         raise ValueError(f"{name} must be finite, but holds a number that is too large for a float") from error
     if real is None:
         got = {"c": "complex ones", "O": "text, dates or masked values among them"}.get(
-            array.dtype.kind, type(value).__name__
+            array.dtype.kind, _kind_of(value)
         )
         raise TypeError(f"{name} must be a sequence of real numbers, got {got}")
     return real
+
+
+def _kind_of(value: Any) -> str:
+    """Return the name of the type of a value, and how to read a file whose path was given in place of its content."""
+    is_file = isinstance(value, str | os.PathLike) and Path(value).suffix
+    remedy = ": read the file with paths.read_path (impulse responses) or signals.read_recording" if is_file else ""
+    return type(value).__name__ + remedy
 
 
 def as_finite_array(value: Any, name: str) -> np.ndarray:
@@ -92,15 +101,17 @@ def require_channels_lead(array: np.ndarray, name: str) -> None:
         )
 
 
-def require_finite(array: Any, name: str) -> None:
-    """Raise ValueError if `array` holds NaN or Inf; the message gives the index of the first one."""
+def require_finite(array: Any, name: str, *, fs: float | None = None, remedy: str = "") -> None:
+    """Raise ValueError if `array` holds NaN or Inf; the message gives the first one's index and, at a rate `fs`, time."""
     finite = np.isfinite(array)
     if not np.all(finite):
         if np.ndim(array) == 0:
             raise ValueError(f"{name} must be finite, got {array}")
         where = tuple(int(i) for i in np.argwhere(~finite)[0])
         at = where[0] if len(where) == 1 else where
-        raise ValueError(f"{name} must be finite, but holds NaN or Inf (first at index {at})")
+        time = "" if fs is None else f", {where[-1] / fs:.6g} s"
+        mend = f"; {remedy}" if remedy else ""
+        raise ValueError(f"{name} must be finite, but holds NaN or Inf (first at index {at}{time}){mend}")
 
 
 def as_number(value: Any, name: str, *, unit: str = "") -> float:
@@ -149,6 +160,11 @@ def as_rate(value: Any, name: str) -> float:
     return rate
 
 
+def same_rate(rate: float, fs: float) -> bool:
+    """Return whether two sampling rates in Hz are equal to rounding."""
+    return abs(rate - fs) <= 1e-9 * fs
+
+
 def per_loudspeaker(
     value: Any, n_loudspeakers: int, name: str, check: Callable[[Any, str], float] = as_positive
 ) -> np.ndarray:
@@ -160,12 +176,14 @@ def per_channel(
     value: Any, size: int, what: str, name: str, check: Callable[[Any, str], float] = as_positive
 ) -> np.ndarray:
     """Return one number, or one for each channel, as (size,); each must pass `check`. `what` names the channels."""
+    if np.ndim(value) == 0:
+        return np.full(size, check(value, name))
     numbers = as_real_array(value, name)
-    if numbers.shape not in ((), (size,)):
-        raise ValueError(
-            f"{name} must be one number or one for each of the {size} {what}, ({size},), got shape {numbers.shape}"
-        )
-    return np.array([check(number, name) for number in np.broadcast_to(numbers, size)])
+    if numbers.shape != (size,):
+        several = f"one number or one for each of the {size} {what}, ({size},)"
+        wanted = f"one number for 1 {what.removesuffix('s')}" if size == 1 else several
+        raise ValueError(f"{name} must be {wanted}, got shape {numbers.shape}")
+    return np.array([check(number, name) for number in numbers])
 
 
 def as_nonnegative(value: Any, name: str, *, unit: str = "") -> float:
@@ -236,6 +254,12 @@ def as_generator(rng: Any) -> np.random.Generator:
     if rng is None:
         raise TypeError("rng must be a seed or a numpy.random.Generator, so that a run can be repeated; got None")
     return np.random.default_rng(rng)
+
+
+def require_existing(path: str | os.PathLike[str]) -> None:
+    """Raise FileNotFoundError if there is no such file."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path} does not exist or is not a file; the current folder is {Path.cwd()}")
 
 
 def how_to_install(extra: str) -> str:

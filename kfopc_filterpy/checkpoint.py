@@ -27,6 +27,7 @@ import numpy as np
 from filterpy.common import inv_diagonal
 from filterpy.kalman import KalmanFilter
 
+from ._validate import require_existing
 from ._writing import replacing
 
 DIGEST = 64  # hexadecimal digits of SHA-256
@@ -143,8 +144,8 @@ class Checkpointed:
         --------
         save : It has an example.
         """
-        path = Path(path)
-        content = path.read_bytes()
+        require_existing(path)
+        content = Path(path).read_bytes()
         if hashlib.sha256(content[:-DIGEST]).hexdigest().encode() != content[-DIGEST:]:
             raise ValueError(
                 f"{path} is damaged, cut short or not a file that `save` wrote: its checksum differs; load an older file, "

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ._taps import feedback_paths, lengthened, primary_paths, sampling_rate, secondary_paths
 from ._types import PathModels
-from ._validate import as_channels, as_count, as_nonnegative, as_positive
+from ._validate import as_channels, as_count, as_nonnegative, as_positive, same_rate
 from .power.amplifiers import Amplifiers, amplifier_of_each
 from .signals.recordings import Recording
 
@@ -217,12 +217,16 @@ class Plant:
         begin = round(at * self.fs)
         fading = [one.begin + one.fade for one in self._changes if one.changed & changed & set(PATHS)]
         same = [one.begin + 1 for one in self._changes if one.changed & changed]
-        free = max([1, *fading, *same, *(one.begin for one in self._changes)])
-        if begin < free:
+        last = max((one.begin for one in self._changes), default=0)
+        free = max([1, *fading, *same])
+        if begin < last:
             raise ValueError(
-                f"time_s must be {free / self.fs:g} s at least, got {at:g} s: it must not be before the last change, nor "
-                f"before the last change of {' or '.join(sorted(changed))} has ended"
+                f"time_s must not be before the last change, at {last / self.fs:g} s, got {at:g} s: chain the changes in "
+                "the order of their times"
             )
+        if begin < free:
+            reason = f": by then the last change of {' or '.join(sorted(changed))} has ended" if same else ""
+            raise ValueError(f"time_s must be {free / self.fs:g} s at least, got {at:g} s{reason}")
         now = self._changes[-1].plant if self._changes else self
         then = Plant(
             now.secondary if secondary is None else secondary,
@@ -476,7 +480,7 @@ def _common_rate(rates: dict[str, float]) -> float:
         raise ValueError("fs must be given, the sample rate in Hz: taps have none, unlike systems and recordings")
     first, fs = next(iter(rates.items()))
     for name, rate in rates.items():
-        if abs(rate - fs) > 1e-9 * fs:
+        if not same_rate(rate, fs):
             raise ValueError(
                 f"the {name} path is sampled at {rate:g} Hz but the {first} path at {fs:g} Hz; resample one "
                 "(resample_path)"

@@ -152,7 +152,7 @@ REFUSED = [
     ({"secondary": SECONDARY[0]}, r"secondary must have shape .*, got \(2, 9\)"),
     ({"secondary": np.moveaxis(SECONDARY, 2, 0)}, "taps come last"),
     ({"secondary": [0.0, np.nan]}, "secondary must be finite"),
-    ({"secondary": "paths.wav"}, "secondary must be a sequence of real numbers, got str"),
+    ({"secondary": "paths.wav"}, "secondary must be a sequence of real numbers, got str: read .* with paths.read_path"),
     ({"secondary": Plant(S, fs=FS)}, "secondary must be a sequence of real numbers, got Plant"),
     ({"secondary": [[fir_path(S, FS)], []]}, "its rows differ in length"),
     ({"secondary": control.TransferFunction([1.0], [1.0, 2.0])}, "secondary must be a discrete-time system"),

@@ -1,6 +1,7 @@
 """Each check of arguments, once: what it takes, what it refuses, and that the message names the argument."""
 
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,6 +53,13 @@ def test_what_is_taken():
         (as_real_array, [[1.0], [1.0, 2.0]], TypeError, "got list, whose rows differ in length"),
         (as_real_array, [1j], TypeError, "x must be a sequence of real numbers, got complex ones"),
         (as_real_array, [1.0, "a"], TypeError, "x must be a sequence of real numbers"),
+        (as_real_array, "abc", TypeError, "x must be a sequence of real numbers, got str$"),
+        (
+            as_real_array,
+            Path("a.wav"),
+            TypeError,
+            "Path: read the file with paths.read_path .* or signals.read_recording",
+        ),
         (as_real_array, np.array([1.0, "a"], dtype=object), TypeError, "text, dates or masked values among them"),
         (as_channels, 1.0, ValueError, r"x must be \(n_samples,\) or \(n_channels, n_samples\), got shape \(\)"),
         (as_channels, np.ones((0, 4)), ValueError, "x must have at least 1 value"),
@@ -72,6 +80,13 @@ def test_what_is_taken():
         (partial(as_choice, choices=("a", "b")), "c", ValueError, "x must be one of 'a', 'b', got 'c'"),
         (lambda value, name: per_loudspeaker(value, 3, name), [1.0, 2.0], ValueError, "each of the 3 loudspeakers"),
         (lambda value, name: per_loudspeaker(value, 2, name), [1.0, 0.0], ValueError, "x must be greater than 0"),
+        (
+            lambda value, name: per_loudspeaker(value, 1, name),
+            [1.0, 2.0],
+            ValueError,
+            r"for 1 loudspeaker, got shape \(2,\)",
+        ),
+        (lambda value, name: per_loudspeaker(value, 2, name), "2 W", TypeError, "x must be a single number, got '2 W'"),
         (lambda value, _: pair(value), 100.0, ValueError, r"band must be a pair \(low, high\)"),
         (lambda value, _: pair(value), (-1.0, 5.0), ValueError, "band must satisfy"),
         (lambda value, _: pair(value), (5.0, 5.0), ValueError, "band must satisfy"),
@@ -82,7 +97,7 @@ def test_what_is_taken():
         (lambda value, name: as_sample_count(1.0, value, name), 0, ValueError, "fs must be greater than 0 Hz"),
         (lambda value, _: as_generator(value), None, TypeError, "rng must be a seed or a numpy.random.Generator"),
     ],
-    ids=range(37),
+    ids=range(41),
 )
 def test_what_is_refused(check, value, error, message):
     with pytest.raises(error, match=message):

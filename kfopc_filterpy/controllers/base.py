@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._types import NumberOrArray, PerLoudspeaker
-from .._validate import as_positive
+from .._validate import as_positive, same_rate
 from ..checkpoint import Checkpointed
 from ..core.block import InUse
 from ..core.run_loop import Steps
@@ -66,13 +66,13 @@ def as_run_rate(fs: float | None, path_fs: float | None) -> float:
     """Return the sample rate in Hz of a law that depends on time: `fs`, or that of the secondary path."""
     if fs is None and path_fs is None:
         raise ValueError(
-            "fs must be given, the sample rate in Hz: the law depends on it, and taps have none; or give a Plant, a system "
-            "or a Recording as secondary"
+            "fs must be given, the sample rate in Hz: taps have none; or give a Plant, a system or a Recording as secondary"
         )
     if fs is None:
         return path_fs  # type: ignore[return-value]
     rate = as_positive(fs, "fs", unit="Hz")
-    require_rates(rate, {"secondary path": path_fs})
+    if path_fs is not None and not same_rate(path_fs, rate):
+        raise ValueError(f"fs is {rate:g} Hz, but secondary brings {path_fs:g} Hz: leave out fs, or resample the path")
     return rate
 
 
@@ -100,11 +100,11 @@ def as_forgetting(value: Any) -> float:
 
 
 def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
-    """Raise ValueError if a named part of a controller has another sample rate than the run's `fs` in Hz."""
+    """Raise ValueError if a controller, or a named part of it, is for another sample rate than the run's `fs` in Hz."""
     for name, rate in rates.items():
-        if rate is not None and abs(rate - fs) > 1e-9 * fs:
+        if rate is not None and not same_rate(rate, fs):
             raise ValueError(
-                f"fs is {fs:g} Hz but the controller's {name} is for {rate:g} Hz: make it with the fs of the run"
+                f"the {name} is for {rate:g} Hz, but the run is at {fs:g} Hz: make it with the fs of the run"
             )
 
 

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from .._taps import lengthened
-from .._validate import as_count, as_number
+from .._validate import as_count, as_number, same_rate
 from ..plant import estimated_secondary
-from .base import require_rates
 from .channel_samples import channel_sample
 from .processing import takes_none
 
@@ -71,6 +70,9 @@ class Channels:
                 f"secondary must have at most the {present[-1]} taps of the present estimate, got {taps.shape[-1]}: make "
                 "the controller with an estimate filled with zeros to the longest path"
             )
-        if self._path_fs is not None:
-            require_rates(self._path_fs, {"new secondary path": rate})
+        if self._path_fs is not None and rate is not None and not same_rate(rate, self._path_fs):
+            raise ValueError(
+                f"the new secondary path is for {rate:g} Hz, but the controller for {self._path_fs:g} Hz; resample it "
+                "(resample_path)"
+            )
         return lengthened(taps, present[-1]).reshape(present)

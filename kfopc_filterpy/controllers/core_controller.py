@@ -168,8 +168,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
 
     def _who_has(self, name: str) -> str:
         """Return which channels have a setting each, "loudspeakers" or "microphones"; "" if all share one."""
-        each = next(one.each for one in Algorithm(self.algorithm).settings if one.name == name)
-        return each if self.multichannel else ""
+        return next(one.each for one in Algorithm(self.algorithm).settings if one.name == name)
 
     def _checked_limiter(self, limiter: Any) -> Any:
         """Return None, a limiter, or a tuple of limiters."""
@@ -265,7 +264,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     def _of_setting(self, name: str) -> Any:
         """Return a setting: a number, or with several channels (J,) or (K,) where each has its own."""
         values = self._block.fields[name].ravel()
-        return values.copy() if self._who_has(name) else float(values[0])
+        return self._shaped(values) if self._who_has(name) else float(values[0])
 
     def _take_setting(self, name: str, value: Any) -> None:
         """Assign a setting, checked."""
@@ -369,10 +368,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
                 f"{self.name} has no rated power that could be changed; kf_opc, kf_pb and mov_fx_lms, for example, have "
                 "one; a limiter keeps one whatever the controller asks for"
             )
-        if self.multichannel:
-            value = per_loudspeaker(value, self.n_loudspeakers, "rated_power")
-        else:
-            value = as_positive(value, "rated_power")
+        value = per_loudspeaker(value, self.n_loudspeakers, "rated_power")
         with self.in_use:
             self._take_rated_power(value)
 
@@ -567,8 +563,8 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         return np.ravel(self.constraint)[0].fs
 
     def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError if the secondary path, power estimates or limiter are for another rate than `fs` in Hz."""
-        rates = {"secondary path": self._path_fs, "power memory": None if self.rated_power is None else self._powers_fs}
+        """Raise ValueError if the controller, its secondary path or a limiter is for another rate than `fs` in Hz."""
+        rates = {"controller": None if self.rated_power is None else self._powers_fs, "secondary path": self._path_fs}
         for j, limiter in enumerate(self._each(self.limiter)):
             rates[f"limiter {j}" if self.multichannel else "limiter"] = limiter.fs
         require_rates(fs, rates)

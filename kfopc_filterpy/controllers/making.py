@@ -5,17 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import wraps
 from inspect import signature
+from numbers import Integral
 from typing import Any, TypeVar, cast
 
 _Maker = TypeVar("_Maker", bound=Callable[..., Any])
 
 
 def controller_maker(make: _Maker) -> _Maker:
-    """Return a function that makes a controller, and says what keeps a rated power if its own law has none."""
+    """Return a function that makes a controller, and says what is wrong with arguments that its law does not take.
+
+    Those are a rated power or a rate, without a use for it, and its first two in the other order.
+    """
     known = signature(make).parameters
 
     @wraps(make)
     def made(*arguments: Any, **settings: Any) -> Any:
+        if len(arguments) > 1 and isinstance(arguments[1], Integral):
+            raise TypeError(
+                f"secondary must be a path or a Plant, got {arguments[1]}: the order is {make.__name__}(n_taps, secondary, ...)"
+            )
         for name in ("rated_power", "fs"):
             if name in settings and name not in known:
                 raise TypeError(

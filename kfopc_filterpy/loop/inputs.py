@@ -28,6 +28,10 @@ class SensorNoise:
     """White noise, drawn stretch by stretch."""
 
     def __init__(self, std: float, rng: Seed | None) -> None:
+        if std > 0 and rng is None:
+            raise TypeError(
+                f"the plant has sensor noise (sensor_noise_std={std:g}): give rng=, a seed or a numpy.random.Generator"
+            )
         self.std = std
         self.rng = as_generator(rng) if std > 0 else None
 

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .._validate import require_existing
+
 _SURE_RATE = 1e-4  # share within which the roundest rate is taken without a word
 _LEAST_ROOM = 64 * 2**20  # bytes of float64 samples that any file may hold
 NO_SIGNAL = 100  # rows: no signal rises for so long
@@ -44,8 +46,7 @@ def require_file(path: str | os.PathLike[str]) -> None:
         raise TypeError(
             f"path must be the path of a file, got {type(path).__name__}: write it to a file, or pass Recording(samples, fs)"
         )
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"{path} does not exist or is not a file; the current folder is {Path.cwd()}")
+    require_existing(path)
     with open(path, "rb") as file:
         is_empty = not file.read(1)
     if is_empty:

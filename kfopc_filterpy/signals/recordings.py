@@ -356,7 +356,9 @@ def read_content(path: str | os.PathLike[str], *, channel: int | None = None, va
         units = (content.unit or "1").split(", ")
         content = content._replace(unit=units[channel % len(units)])
         samples = np.atleast_2d(samples)[as_channel(channel, np.atleast_2d(samples), path)]
-    require_finite(samples, f"the signal of {path}")
+    require_finite(
+        samples, f"the signal of {path}", fs=content.fs, remedy="export it again without gaps, or cut them out"
+    )
     return content._replace(samples=np.ascontiguousarray(samples, dtype=np.float64))
 
 

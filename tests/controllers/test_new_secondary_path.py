@@ -121,7 +121,11 @@ def test_the_loudest_reference_is_that_of_the_new_path(gain: float) -> None:
         (S_HAT, np.ones(5), "at most the 4 taps of the present estimate, got 5"),
         (S_HAT, [0.0, np.nan], "secondary"),
         (S_HAT, [0.0], "secondary must not be all zeros"),
-        (fir_path(S_HAT, FS), fir_path([0.0, 1.0], 2 * FS), "secondary path is for 16000 Hz"),
+        (
+            fir_path(S_HAT, FS),
+            fir_path([0.0, 1.0], 2 * FS),
+            "secondary path is for 16000 Hz, but the controller for 8000 Hz; resample",
+        ),
         ([[S_HAT]], np.ones((2, 1, 4)), r"\(microphones, loudspeakers\) = \(1, 1\) of the present .* got \(2, 1\)"),
         ([[S_HAT]], np.ones((1, 1, 5)), "at most the 4 taps"),
         ([[S_HAT]], [[[np.nan, 1.0]]], "secondary"),

@@ -210,7 +210,7 @@ def test_a_run_at_another_rate_is_refused() -> None:
     paths = random_paths(2, 1, 6, seed=1)
     inner_one = kf_pb(TAPS, paths[1:], rated_power=1.0, fs=FS)
     controller = VirtualMicrophones(inner_one, paths, [[[1.0]]], physical=[0])
-    with pytest.raises(ValueError, match="power memory is for 4000 Hz"):
+    with pytest.raises(ValueError, match="the controller is for 4000 Hz, but the run is at 8000 Hz"):
         simulate(controller, noise(), Plant(paths, fs=2 * FS), disturbance=np.zeros((2, 1500)))
     observer = KalmanObserver(random_model(False)[:2, :2], 1, sensor_noise_std=0.1)
     controller = VirtualMicrophones(silent(), paths, observer, physical=[0])

@@ -26,7 +26,11 @@ REFUSED = [
     ({"plant": PLANT_AND_PRIMARY}, ValueError, "gives the disturbance, and so does disturbance=: give one of them"),
     ({"disturbance": None}, ValueError, "make the plant with a primary path, or give disturbance="),
     ({"plant": S}, TypeError, "plant must be a Plant, got ndarray"),
-    ({"plant": Plant(S, fs=FS, sensor_noise_std=0.1)}, TypeError, "rng must be a seed or a numpy.random.Generator"),
+    (
+        {"plant": Plant(S, fs=FS, sensor_noise_std=0.1)},
+        TypeError,
+        r"the plant has sensor noise \(sensor_noise_std=0.1\): give rng=, a seed or a numpy.random.Generator",
+    ),
     ({"switch_on_s": 300 / FS}, ValueError, "switch_on_s must leave samples to control"),
     ({"record_weights_every": 0.5}, TypeError, "record_weights_every must be a whole number"),
 ]

@@ -299,8 +299,10 @@ def test_nan_is_refused_with_its_place_and_only_in_the_channel_that_is_read(tmp_
     np.save(tmp_path / "x.npy", table)
     np.savetxt(tmp_path / "x.csv", table.T, delimiter=",")
     scipy.io.savemat(tmp_path / "x.mat", {"noise": table})
-    for name in ("x.wav", "x.npy", "x.csv", "x.mat"):
-        with pytest.raises(ValueError, match=rf"{name} must be finite, .* \(first at index \(0, 1\)\)"):
+    for name, time in {"x.wav": f", {1 / FS:g} s", "x.npy": "", "x.csv": "", "x.mat": ""}.items():
+        with pytest.raises(
+            ValueError, match=rf"{name} must be finite, .* \(0, 1\){time}\); export it again without gaps"
+        ):
             read_recording(tmp_path / name, fs=FS)
         assert read_recording(tmp_path / name, channel=1, fs=FS).samples.tolist() == [0.0, 0.0, 1.0]
 
