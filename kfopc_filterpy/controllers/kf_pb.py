@@ -100,6 +100,12 @@ class PowerBudgetInCore(CoreController):
         return self._fs
 
     @property
+    def averaging_s(self) -> float:
+        """Time in seconds over which the mean power is kept to the rated power, in whole blocks."""
+        fields = self._block.fields
+        return float(fields["averaging"].item() * fields["block"].item() / self._fs)
+
+    @property
     def power_weight(self) -> NumberOrArray:
         """Price of power of the last block, or with several channels that of each loudspeaker, (J,)."""
         return self._number_of_each("price")
@@ -168,13 +174,14 @@ def kf_pb(
     fs : float, optional
         Sample rate in Hz; a system, a recording or a plant as `secondary` brings it.
     averaging_s : float, default 10
-        Time in seconds over which the mean power is kept to the rated power, at least 20 blocks of 32 ms.
+        Time in seconds over which the mean power is kept to the rated power, at least 20 blocks of 32 ms (0.64 s). It
+        is rounded to whole blocks.
 
     Returns
     -------
     CoreController
         A controller named KF-PB. Besides what others have, it tells `alarms`, the number of times that the errors
-        contradicted the paths, and the posterior means `primary_path` and `identified_path`.
+        contradicted the paths, the posterior means `primary_path` and `identified_path`, and `averaging_s`.
 
     Raises
     ------
@@ -220,7 +227,12 @@ def kf_pb(
     fs = as_run_rate(fs, path_fs)
     samples, block = as_positive(averaging_s, "averaging_s", unit="s") * fs, block_of(fs)
     if samples > MOST_BLOCKS * block:
-        raise ValueError(f"averaging_s must be at most {MOST_BLOCKS * block / fs:g} s, got {averaging_s:g}")
+        raise ValueError(f"averaging_s must be at most {MOST_BLOCKS * block / fs:g} s, got {averaging_s:g} s")
+    if round(samples / block) < LEAST_BLOCKS:
+        raise ValueError(
+            f"averaging_s must be at least {LEAST_BLOCKS * block / fs:g} s, {LEAST_BLOCKS} blocks of {block} samples, got "
+            f"{averaging_s:g} s: to keep the power over a shorter time, give limiter=OutputLimiter(..., window_s=...)"
+        )
     controller = PowerBudgetInCore(
         "KF-PB",
         "power_budget",
@@ -229,7 +241,7 @@ def kf_pb(
         settings={
             "rated_power": rated_power,
             "block": block,
-            "averaging": max(round(samples / block), LEAST_BLOCKS),
+            "averaging": round(samples / block),
             "window": math.exp(-1.0 / min(samples / WINDOWS, WINDOW_S * fs)),
             "memory": math.exp(-1 / (MEMORY_S * fs)),
             "spread": relative_spread(secondary_path_uncertainty, paths),

@@ -45,9 +45,9 @@ def worst_mean(y: np.ndarray, averaging_s: float = AVERAGING_S) -> float:
 
 
 def test_another_sample_rate_than_that_of_the_run_is_refused() -> None:
-    with pytest.raises(ValueError, match="fs is 4000 Hz but the controller's power memory is for 2000 Hz"):
+    with pytest.raises(ValueError, match="the controller is for 2000 Hz, but the run is at 4000 Hz: make it with"):
         simulate(made(), noise(0.1), Plant(S, PRIMARY, fs=4000))
-    with pytest.raises(ValueError, match="secondary path is for 8000 Hz"):
+    with pytest.raises(ValueError, match="fs is 2000 Hz, but secondary brings 8000 Hz: leave out fs"):
         run(made(fir_path(S, 8000.0)), noise(0.1))
 
 
@@ -64,6 +64,11 @@ def test_the_spread_is_the_rms_of_the_error_over_the_spectrum_of_the_path() -> N
 
 
 # ---- What it tells
+
+
+@pytest.mark.parametrize(("averaging_s", "blocks"), [(0.64, 20), (2.0, 62), (10.0, 312)])  # of 64 samples at 2 kHz
+def test_it_tells_its_averaging_time_in_whole_blocks(averaging_s: float, blocks: int) -> None:
+    assert made(averaging_s=averaging_s).averaging_s == blocks * 0.032
 
 
 def test_it_learns_both_paths() -> None:
