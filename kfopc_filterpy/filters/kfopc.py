@@ -46,6 +46,14 @@ class Assigned:
         kf.__dict__[self.name] = self.check(kf, value, self.name)
 
 
+def _as_transition(kf: Any, value: Any, name: str) -> Any:
+    """Return F as an array; with a rated power it must be the identity."""
+    F = checked_steps.as_matrix(value, name)
+    if kf._constraint is not None:
+        kf._require_random_walk(F)
+    return F
+
+
 class KFOPC(KalmanFilter, Checkpointed):
     r"""Kalman filter with output power constraint, a drop-in `filterpy.kalman.KalmanFilter`.
 
@@ -128,7 +136,7 @@ class KFOPC(KalmanFilter, Checkpointed):
     z: Any
     K: Any
     _mahalanobis: Any
-    F: Any = Assigned(lambda _, value, name: checked_steps.as_matrix(value, name))
+    F: Any = Assigned(_as_transition)
     H: Any = Assigned(lambda _, value, name: checked_steps.as_matrix(value, name))
 
     def __init__(
@@ -191,7 +199,8 @@ class KFOPC(KalmanFilter, Checkpointed):
         Returns
         -------
         RandomWalkKFOPC
-            A KFOPC whose `predict` and `update` cost O(L^2); subclass that class to extend it.
+            A KFOPC whose `predict` and `update` cost O(L^2); subclass that class to extend it. To change a noise, assign
+            it, ``kf.Q = 2 * kf.Q``: numpy refuses ``kf.Q *= 2``, because the array is read-only.
 
         Raises
         ------
@@ -417,11 +426,12 @@ class KFOPC(KalmanFilter, Checkpointed):
             raise TypeError(f"constraint must be an OutputPowerConstraint or None, got {value!r}; {ONE_CHANNEL}")
         if self.dim_z != 1:
             raise ValueError(f"a rated power needs one measurement, dim_z = 1, got dim_z = {self.dim_z}; {ONE_CHANNEL}")
+        self._require_random_walk(self.F)
         self._constraint = deepcopy(value)
 
     @property
     def constraint_factor(self) -> float:
-        """Factor that scales the measurement; assign a value to fix it, None to follow eq. 13 again."""
+        """Factor that scales the measurement; assign a value from 0 to 1 to fix it, None to follow eq. 13 again."""
         return 1.0 if self._constraint is None else self._constraint.factor
 
     @constraint_factor.setter

@@ -39,6 +39,8 @@ def _as_multiple(kf: Any, value: ArrayLike, name: str) -> np.ndarray:
     checked_steps.require_matrix(matrix, (n, n), name)
     if name != "F":
         checked_steps.require_variance(matrix, n, name)
+    elif kf._constraint is not None:
+        kf._require_random_walk(matrix)
     multiple = float(matrix[0, 0]) if name != "F" else 1.0
     plain = np.array_equal(matrix, multiple * np.eye(n))
     matrix.flags.writeable = not plain
@@ -64,6 +66,7 @@ class RandomWalkKFOPC(KFOPC):
     - `F`, `Q` and `R` are returned as read-only arrays. Assign a number to `Q` or `R` to change the noise.
     - What is written into `P` counts at the next step, as in filterpy. A `P` that is not symmetric and positive
       semidefinite is refused then, which costs O(L^3), but only after `P` was assigned or written into.
+    - `update` needs an `H`, passed or assigned: the default, zeros, would correct nothing.
     - If another F or a full Q is assigned or passed, or with `B` and `u`, or an H of several rows, the step uses
       filterpy's own equations, in O(L^3).
 
@@ -115,6 +118,7 @@ class RandomWalkKFOPC(KFOPC):
         self._blurred = False  # h'P h was nothing but rounding
         self._predicted = False  # P is P_prior
         self._gain, self._last = np.zeros(n_taps), (0.0, 0.0, 0.0)  # K of the last update; its z, y and S
+        self._default_row = self.H
         del self.__dict__["P"]
 
     # The steps.
@@ -220,6 +224,11 @@ class RandomWalkKFOPC(KFOPC):
             z = None if np.ma.is_masked(z) else z.data
         if z is None or self.inv is not inv or np.size(row) != n:
             return None
+        if row is self._default_row and not row.any():
+            raise ValueError(
+                "H is not known: pass update(z, H=...), the newest filtered reference samples, or assign kf.H. The default, "
+                "zeros, corrects nothing. Nothing was changed"
+            )
         usual_z = isinstance(z, float) or (type(z) is np.ndarray and z.dtype == FLOAT and z.shape in ((), (1,), (1, 1)))
         usual_H = type(row) is np.ndarray and row.dtype == FLOAT and row.shape in ((n,), (1, n))
         if not usual_z or not usual_H or R is not None:

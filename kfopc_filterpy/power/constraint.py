@@ -128,12 +128,17 @@ class OutputPowerConstraint:
 
     @property
     def factor(self) -> float:
-        """Constraint factor last used; assign a value to fix it, None to compute it again."""
+        """Constraint factor last used; assign a value from 0 to 1 to fix it, None to compute it again."""
         return self._read("factor")
 
     @factor.setter
     def factor(self, value: float | None) -> None:
-        self._supply("factor", None if value is None else as_nonnegative(value, "constraint_factor"))
+        factor = None if value is None else as_nonnegative(value, "constraint_factor")
+        if factor is not None and factor > 1.0:
+            raise ValueError(
+                f"constraint_factor must be 1 at most (eq. 13), got {factor:g}: 1 leaves the measurement as it is"
+            )
+        self._supply("factor", factor)
 
     @property
     def disturbance_power(self) -> float:

@@ -154,7 +154,23 @@ def test_without_any_noise_what_is_known_exactly_tells_nothing() -> None:
         kf.P = 1.0
 
 
-# F, Q and R as a user meets them; P is in the machine
+# F, Q, R and H as a user meets them; P is in the machine
+
+
+def test_an_update_before_any_H_is_refused_but_a_silent_one_is_not() -> None:
+    kf = KFOPC.random_walk(3, state_noise=0.1, measurement_noise=0.5)
+    twin = copy.deepcopy(kf)
+    for f in (kf, copy.deepcopy(kf)):
+        with pytest.raises(ValueError, match=r"H is not known: pass update\(z, H=\.\.\.\).*assign kf\.H"):
+            f.update(1.0)
+    for f in (kf, twin):
+        f.update(None)
+        f.update(1.0, H=np.zeros(3))
+    kf.H = np.zeros((1, 3))
+    kf.update(1.0)
+    twin.H[0, 0] = 1.0  # written into the default
+    twin.update(1.0)
+    assert (kf.x.any(), twin.x.any()) == (False, True)
 
 
 @pytest.mark.parametrize("name", ["F", "Q", "R"])

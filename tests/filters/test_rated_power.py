@@ -94,8 +94,8 @@ def test_a_factor_that_is_fixed_scales_the_measurement(kind: str) -> None:
 def test_a_tracker_is_refused_before_anything_changes() -> None:
     """Its measurement would be scaled: the estimate of a target at 19.8 m, moving at 2 m/s, would be 1.7 m."""
     kf = KFOPC(2, 1, rated_power=1.0, fs=10)
-    kf.F, kf.H = [[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.0]]
-    kf.secondary_path_gain, kf.M = 1.0, np.zeros((2, 1))
+    kf.H, kf.M, kf.secondary_path_gain = [[1.0, 0.0]], np.zeros((2, 1)), 1.0
+    kf.F[0, 1] = 0.1
     x, P = kf.x, kf.P
     for step in (kf.predict, kf.predict_steadystate, lambda: kf.update(19.8), lambda: kf.update_correlated(19.8)):
         with pytest.raises(
@@ -109,9 +109,24 @@ def test_a_tracker_is_refused_before_anything_changes() -> None:
     kf.rated_power = None
     kf.predict()
     kf.update(19.8)
+    with pytest.raises(ValueError, match="F must be the identity"):
+        kf.rated_power = 1.0
+    assert kf.rated_power is None
     kf = make("random walk", constraint=constraint())
     with pytest.raises(ValueError, match="F must be the identity"):
         kf.predict(F=0.9 * np.eye(TAPS))
+
+
+@both_kinds
+def test_another_F_is_refused_when_it_is_assigned_and_the_filter_goes_on(kind: str) -> None:
+    kf = make(kind, constraint=constraint())
+    for other in (2.0 * np.eye(TAPS), (0.9 * np.eye(TAPS)).tolist()):
+        with pytest.raises(ValueError, match="F must be the identity"):
+            kf.F = other
+    kf.predict()
+    kf.F = np.eye(TAPS)
+    kf.rated_power = None
+    kf.F = 0.9 * np.eye(TAPS)
 
 
 @both_kinds
