@@ -93,8 +93,10 @@ def mov_fx_lms(
 
     Parameters
     ----------
-    n_taps, secondary, step_size, n_references
+    n_taps, secondary, n_references
         As for `fx_lms`.
+    step_size : float
+        Step size mu, above zero. Start where `fx_lms` starts, times the constraint factor that the penalty stands for.
     rated_power : float or array_like, shape (J,), optional
         Rated output power rho_o, or that of each loudspeaker.
     constraint : OutputPowerConstraint or sequence of J of them, optional

@@ -135,6 +135,29 @@ def test_two_gradients_settle_where_they_balance(ratio: float) -> None:
 # ---- Steps
 
 
+@pytest.mark.parametrize("kind", ["white", "tone"])
+@pytest.mark.parametrize("factor", [None, 0.2])
+def test_a_tenth_of_the_bound_converges_and_twice_the_bound_does_not(kind: str, factor: float | None) -> None:
+    """A tone of 200 Hz has only a twentieth of the bound of a white reference."""
+    taps, delay, n = 64, 20, 64_000
+    x = np.random.default_rng(0).standard_normal(n)
+    if kind == "tone":
+        x = np.sqrt(2.0) * np.sin(2 * np.pi * 200 * np.arange(n) / FS)
+    plant = Plant(np.eye(1, delay + 1, delay)[0], np.eye(1, 60, 59)[0], fs=FS)  # P = E[d^2] = G_s = 1
+    bound = 2 / (taps + delay) if kind == "white" else 2 * np.sin(np.pi / (4 * delay + 2)) / taps
+
+    def left(share: float) -> float:
+        if factor is None:
+            controller = fx_lms(taps, plant, step_size=share * bound)
+        else:
+            controller = mov_fx_lms(taps, plant, step_size=share * factor * bound, rated_power=factor**2)
+        run = simulate(controller, x, plant)
+        return np.inf if run.diverged_at_s else np.mean(run.error[-n // 4 :] ** 2) ** 0.5
+
+    assert left(0.1) == pytest.approx(1.0 - (factor or 1.0), abs=0.02)
+    assert left(2.0 if factor is None else 2.0 / factor) > 1.0
+
+
 def test_a_normalised_step_does_not_depend_on_the_level_and_is_stable_up_to_2() -> None:
     """On paths without delay, where the error power cannot grow within a step that is below 2, and does above."""
     flat = np.random.default_rng(8).standard_normal((3, 2, 1)) * np.eye(1, 3)
