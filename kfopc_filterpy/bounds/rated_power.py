@@ -61,7 +61,7 @@ def required_rated_power(
     reference : array_like, shape (n_samples,) or (I, n_samples)
         Reference signal x.
     plant : Plant
-        Plant, of which the paths count: the bound has linear amplifiers.
+        Plant, of which the paths count: the bound has linear amplifiers and no sensor noise.
     n_taps : int
         Taps of each control filter.
     disturbance : array_like, shape (n_samples,) or (K, n_samples), optional

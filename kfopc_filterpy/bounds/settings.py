@@ -92,10 +92,10 @@ def suggest_settings(
     reference : array_like, shape (n_samples,) or (I, n_samples)
         Reference x of the silent run.
     plant : Plant
-        Plant with the estimated secondary path.
+        Plant with the estimated secondary path. Its sensor noise counts, too: it is part of q.
     disturbance : array_like, shape (n_samples,) or (K, n_samples), optional
         Signal of the error microphone, the disturbance d, in place of the plant's primary path. Leave out its start-up
-        transient.
+        transient. It has the microphone's noise in it.
     memory_s : float, default 0.25
         Memory of the filter in seconds. A longer one leaves less error, a shorter one follows changes of the noise and
         of the paths faster.
@@ -135,7 +135,8 @@ def suggest_settings(
       chance. The second one is the price of forgetting: for a white filtered reference, P settles at
       :math:`\sqrt{rq/E[x'^2]}` in each direction, and so the error power is :math:`qL/M` above q.
     - :math:`q = J(L)\, N / (N - L)`, but at least -60 dB of the disturbance, because a microphone is hardly ever
-      quieter.
+      quieter, and at least the power of the plant's sensor noise. If the plant's primary path gives d, that power is
+      added to J and to :math:`E[d^2]`.
     - :math:`r = q / (k\, E[x'^2] M^2)`. If the noise comes in bursts, so does what no filter explains, and it disturbs
       the weights when the filter's gain is largest. The memory is then lengthened by :math:`\sqrt{k}`: k is the mean
       square of the power over 10 ms, divided by that of the power over the memory. It is 1 for a steady noise.
@@ -163,7 +164,7 @@ def suggest_settings(
     >>> suggested
     <SuggestedSettings: n_taps=24, state_noise=9.77e-10, measurement_noise=0.01, initial_variance=0.0821, at 16000 Hz>
     >>> print(suggested.reasons["state_noise"])
-    the filter averages over 0.25 s; that costs up to 0.03 dB, and a shorter time follows faster
+    the filter averages over 0.25 s; that costs up to 0.03 dB, and a shorter memory follows changes faster
     >>> kf_opc(suggested.n_taps, plant, rated_power=1.0, **suggested.noises).name
     'KF-OPC'
     """
@@ -171,11 +172,13 @@ def suggest_settings(
     fs = plant.fs
     memory = as_positive(memory_s, "memory_s", unit="s") * fs
     fit = _Fits(*checked_signals(plant, reference, disturbance), plant, n_taps, max_taps)
-    longest, d_power, filtered_power = fit.stretch.n_taps, mean_square(fit.stretch.d), fit.filtered_power
-    errors, quietest = fit.error_powers(0.0), ERROR_THAT_MATTERS * d_power
+    sensor_noise = plant.sensor_noise_std**2
+    unheard = sensor_noise if disturbance is None else 0.0  # a recording has it
+    longest, d_power, filtered_power = fit.stretch.n_taps, mean_square(fit.stretch.d) + unheard, fit.filtered_power
+    errors, quietest = fit.error_powers(0.0) + unheard, max(ERROR_THAT_MATTERS * d_power, sensor_noise)
     if n_taps is None:
         learned = max(float(errors[-1]), quietest) * longest * fit.per_tap * filtered_power  # q / (M P0), and below
-        reached = np.maximum(fit.error_powers(learned / (memory * d_power * fit.n_microphones)), quietest)
+        reached = np.maximum(fit.error_powers(learned / (memory * d_power * fit.n_microphones)) + unheard, quietest)
         costs = reached * (1 + fit.crowding * np.arange(1, longest + 1) / memory)
         enough = int(np.argmax(costs <= costs.min() * 10 ** (GAIN_THAT_MATTERS_DB / 10))) + 1  # the shortest length
         taps = min(-(-enough // MULTIPLE) * MULTIPLE, longest)
@@ -192,7 +195,9 @@ def suggest_settings(
         fs=fs,
         reasons={
             "n_taps": _why_length(errors, taps, d_power, n_taps, max_taps),
-            "measurement_noise": _why_noise(errors[taps - 1], taps, d_power, fit.stretch.d.shape[-1] / fs),
+            "measurement_noise": _why_noise(
+                errors[taps - 1], taps, d_power, fit.stretch.d.shape[-1] / fs, sensor_noise
+            ),
             "state_noise": _why_memory(memory / fs, lengthened / fs, fit.crowding * taps / lengthened),
             "initial_variance": (
                 f"{fit.variance_rule} with E[d^2] = {d_power:.3g} and E[x'^2] = {filtered_power:.3g}: independent "
@@ -296,13 +301,16 @@ def _why_length(errors: np.ndarray, taps: int, d_power: float, n_taps: int | Non
     return reason
 
 
-def _why_noise(error_power: float, taps: int, d_power: float, record_s: float) -> str:
+def _why_noise(error_power: float, taps: int, d_power: float, record_s: float, sensor_noise: float) -> str:
+    if max(error_power, ERROR_THAT_MATTERS * d_power) < sensor_noise:
+        return f"the power of the plant's sensor noise, which is more than the {error_power:.3g} that the record tells"
     if error_power < ERROR_THAT_MATTERS * d_power:
         level = -10 * np.log10(ERROR_THAT_MATTERS)
         return f"{level:.0f} dB below the disturbance's power of {d_power:.3g}: a microphone is hardly ever quieter"
     level = max(reduction_db(error_power, d_power), 0.0)
+    noise = f", the plant's sensor noise of {sensor_noise:.3g} included" if sensor_noise else ""
     return (
-        f"the power that the best fixed filter of {taps} taps leaves in {record_s:.3g} s of the record, "
+        f"the power that the best fixed filter of {taps} taps leaves in {record_s:.3g} s of the record{noise}, "
         f"{level:.1f} dB below the disturbance's power of {d_power:.3g}"
     )
 
@@ -311,4 +319,4 @@ def _why_memory(memory_s: float, lengthened_s: float, taps_per_memory: float) ->
     reason = f"the filter averages over {memory_s:.3g} s"
     if lengthened_s > NOTABLY_LONGER * memory_s:
         reason += f", lengthened to {lengthened_s:.3g} s because the noise comes in bursts"
-    return f"{reason}; that costs up to {10 * np.log10(1 + taps_per_memory):.2f} dB, and a shorter time follows faster"
+    return f"{reason}; that costs up to {10 * np.log10(1 + taps_per_memory):.2f} dB, and a shorter memory follows changes faster"

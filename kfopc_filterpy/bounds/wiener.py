@@ -86,7 +86,7 @@ def wiener_solution(
     reference : array_like, shape (n_samples,)
         Reference signal x.
     plant : Plant
-        Plant of one channel, of which the paths count: the bound has linear amplifiers.
+        Plant of one channel, of which the paths count: the bound has linear amplifiers and no sensor noise.
     n_taps : int
         Length of the control filter.
     disturbance : array_like, shape (n_samples,), optional

@@ -93,6 +93,20 @@ def test_the_noises_and_the_variance_are_those_of_the_formulas():
     assert memory > 0.5
 
 
+def test_the_sensor_noise_of_the_plant_is_part_of_q_and_a_recording_has_it():
+    noisy = Plant(S, np.pad(S[2:], (20, 0)), fs=FS, sensor_noise_std=0.1)
+    computed, recorded = suggest_settings(X, noisy), suggest_settings(X, PLANT, disturbance=D)  # with q = 0.01
+    assert computed.measurement_noise == pytest.approx(0.01, rel=1e-6)
+    assert "the plant's sensor noise of 0.01 included, 18.7 dB below" in computed.reasons["measurement_noise"]
+    assert computed.n_taps == recorded.n_taps
+    for name, value in recorded.noises.items():
+        assert getattr(computed, name) == pytest.approx(value, rel=5 * np.sqrt(2 / X.size))
+    assert suggest_settings(X, noisy, disturbance=D).noises == recorded.noises  # not twice
+    quiet = suggest_settings(X, noisy, disturbance=Plant(S, noisy.primary, fs=FS).disturbance(X))
+    assert quiet.measurement_noise == pytest.approx(0.01, rel=1e-12)
+    assert quiet.reasons["measurement_noise"].startswith("the power of the plant's sensor noise")
+
+
 def test_q_has_no_bias_from_the_weights_fitted():
     """27 weights on 300 samples take a tenth of the residual: 160 estimates average to q within 4 sigma."""
     estimates = []
