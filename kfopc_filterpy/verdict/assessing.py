@@ -24,6 +24,7 @@ from kfopc_filterpy._validate import (
 from kfopc_filterpy.bounds import coherence_bound, predictor_reference
 from kfopc_filterpy.bounds.wiener import mean_square, reduction_db
 from kfopc_filterpy.controllers.kf_pb import DEFAULT_UNCERTAINTY
+from kfopc_filterpy.loop.inputs import SensorNoise
 from kfopc_filterpy.metrics import (
     a_weighted_level_db,
     a_weighting_db,
@@ -66,6 +67,7 @@ MOST_BANDS = 3  # that a note names
 LOUDER_DB, HEARD = 1.0, 1e-3  # of a third octave: by how much, and its least share of the A-weighted power that remains
 DIFFERING_DB = -6.0  # left of a recorded disturbance by a primary path, from which a note says so
 NEARLY_FREE = 1e6  # times the power of the bound: an amplifier without limits
+SEED = 7_315_846_209  # of the plant's sensor noise: no likely seed of a noise, with which it would be correlated
 
 
 @one_blas_thread()
@@ -99,7 +101,8 @@ def assess(
         (see `feedback`). A `Recording` must have the plant's sample rate.
     plant : Plant
         Paths from each reference and from each control signal to each error microphone. The primary path may be missing
-        if there is a `disturbance`, or no reference microphone. The amplifiers are those of the `rating`.
+        if there is a `disturbance`, or no reference microphone. The amplifiers are those of the `rating`. Its sensor
+        noise is added to a disturbance that the primary path gives; a recorded one has its own.
     rating : float, AmplifierRating, LoudspeakerRating, or a sequence of them
         What the amplifier and the loudspeaker bear; a number is a rated power in squared units of the control signal.
         With several loudspeakers one rating for all, or a sequence with an entry for each: a rating, or a sequence of
@@ -250,7 +253,7 @@ def assess(
     reached = _reduction(run)
     loop = _settled_loop(run, s, secondary_path_uncertainty) if feedback else None
     coherence_db = None
-    if disturbance is not None and not feedback:
+    if (disturbance is not None or plant.sensor_noise_std) and not feedback:
         # Segments as long as sixteen of them allow.
         segment = int(2 ** np.clip(np.floor(np.log2(max(bounds.x.shape[-1] / 16, 8))), 3, 14))
         coherence_db = max(coherence_bound(bounds.x, bounds.d, fs, segment=segment).overall_db, bounds.time_db)
@@ -278,8 +281,9 @@ def assess(
     if disturbance is not None:
         notes += clipping_remarks(disturbance, "disturbance") + _on_differing_path(noise, plant, disturbance)
     elif p is not None:
+        lacking = "shows only the plant's sensor noise" if plant.sensor_noise_std else "is not checked"
         notes.append(
-            "The disturbance was computed from the reference, so the coherence is not checked: record both microphones "
+            f"The disturbance was computed from the reference, so the coherence {lacking}: record both microphones "
             "together and give the disturbance."
         )
     notes += _on_uncertain_path(loop, s, secondary_path_uncertainty)
@@ -354,6 +358,8 @@ def recorded_signals(
         _, d = checked_signals(plant, x, None)
     if not np.any(d):
         raise ValueError("disturbance must not be silent: every value is 0")
+    if disturbance is None and plant.primary is not None:
+        d = d + SensorNoise(plant.sensor_noise_std, SEED).take(*d.shape)
     if feedback:
         x = np.concatenate((x, predictor_reference(d)))
     return (x[0], d[0], s[0, 0]) if (K, J, len(x)) == (1, 1, 1) else (x, d, s)

@@ -55,7 +55,8 @@ class Ceilings:
     Attributes
     ----------
     coherence_db : float or None
-        What the coherence of reference and disturbance allows; None if the disturbance was computed from the reference.
+        What the coherence of reference and disturbance allows; None if the disturbance was computed from the reference,
+        without sensor noise.
     time_db : float
         A filter that may look ahead, with any power.
     filter_db : float

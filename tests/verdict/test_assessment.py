@@ -97,6 +97,19 @@ def test_a_fault_is_found_as_the_cause_and_without_it_the_same_scene_is_enough(c
     assert repr(better).startswith(f"Enough: {better.algorithm} reaches")
 
 
+def test_the_sensor_noise_of_the_plant_limits_unless_the_disturbance_was_recorded_with_its_own():
+    """As loud as the disturbance, it leaves half of what is heard."""
+    noisy = Plant(SECONDARY, arriving(20), fs=FS, sensor_noise_std=1.0)
+    options = {"rating": PLENTY, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None}
+    verdict = assess(noise(), noisy, **options)
+    assert verdict.limited_by == "coherence"
+    for reached in (verdict.ceilings.filter_db, verdict.noise_reduction_db):
+        assert reached == pytest.approx(10 * np.log10(2), abs=0.5)  # 32 weights fit some of it by chance
+    assert any("the coherence shows only the plant's sensor noise" in note for note in verdict.notes)
+    recorded = [assess(noise(), plant, disturbance=heard(arriving(20), 15.0), **options) for plant in (PLANT, noisy)]
+    assert recorded[0].noise_reduction_db == recorded[1].noise_reduction_db > 10.0
+
+
 def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing(tmp_path):
     """Noise within the mean power has peaks beyond a sine's: a fixed filter would do, the run does not, with more it does."""
     small = on(rating=AmplifierRating(ohm=8.0, sine_watt=0.75 * 2, volts_per_unit=4.0), want_db=14.0)
