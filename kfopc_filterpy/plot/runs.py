@@ -12,6 +12,8 @@ These rules hold for the functions here and in `kfopc_filterpy.plot.signals`:
 - The part of a run after its divergence is left out; its legend entry says when it diverged.
 - Signals are in the unit of the results' signals, powers are mean squares in that unit squared; times are in s,
   frequencies in Hz, levels in dB.
+- Times begin when the control is switched on, as results do: with ``simulate(..., switch_on_s=2.0)``, a plant that
+  changes at 5 s does so at 3 s in a figure.
 - Results or settings that are not as described raise TypeError or ValueError, and the message names the argument.
 """
 
@@ -42,10 +44,11 @@ def plot_nse(
     *,
     window_s: float | None = None,
     time_axis: str = "linear",
+    noise_reduction: bool = False,
     channel: int | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the normalised squared error over time (the paper's Fig. 6 a and 7 a).
+    """Draw the normalised squared error (NSE) over time (the paper's Fig. 6 a and 7 a), or the noise reduction.
 
     The axis says how long the window is. Over seconds of noise, a window of 5 ms, as in the figures of merit, fills the
     figure with a solid block; over the first tenths of a second, a longer one hides how fast a controller converges.
@@ -59,6 +62,8 @@ def plot_nse(
         ten, and at least 5 ms: 5 ms for 0.25 s, 20 ms for 2 s, 1 s for a minute. With a logarithmic axis 5 ms.
     time_axis : {"linear", "log"}, default "linear"
         "log" shows the start.
+    noise_reduction : bool, default False
+        Draw the noise reduction in dB, which is the NSE with the other sign: higher is better.
     channel : int, optional
         Microphone to show, from 0; by default all together, as `nse_db` takes them.
     ax : matplotlib.axes.Axes, optional
@@ -85,9 +90,14 @@ def plot_nse(
     >>> ax.get_ylabel()
     'Normalised squared error (dB)\\nover 5 ms'
     >>> plt.close(ax.figure)
+    >>> ax = plot_nse(result, noise_reduction=True)
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('Time since switch-on (s)', 'Noise reduction (dB)\\nover 5 ms')
+    >>> plt.close(ax.figure)
     """
     shown = curves(results)
     scale = as_choice(time_axis, "time_axis", ("linear", "log"))
+    sign, quantity = (-1.0, "Noise reduction") if noise_reduction else (1.0, "Normalised squared error")
     if window_s is None:
         longest = max(curve.run.n_samples / curve.run.fs for curve in shown)
         window_s = SHORT_WINDOW_S if scale == "log" else readable_window_s(longest)
@@ -95,16 +105,16 @@ def plot_nse(
     levels = []
     for curve in shown:
         e, d = (curve.stack(name, channel=channel) for name in ("error", "disturbance"))
-        levels.append(nse_db(e, d, curve.run.fs, window_s, runs=True))
+        levels.append(sign * nse_db(e, d, curve.run.fs, window_s, runs=True))
     ax = new_axes(ax)
-    for i, (curve, nse) in enumerate(zip(shown, levels, strict=True)):
+    for i, (curve, level) in enumerate(zip(shown, levels, strict=True)):
         # Neighbouring values share their window.
-        rows = thinned(nse.size, width // 4, most=8000)
+        rows = thinned(level.size, width // 4, most=8000)
         if scale == "log":
-            rows = np.unique(np.geomspace(1, nse.size, 2000).astype(int)) - 1
-        curve.draw(ax, nse, i, rows)
+            rows = np.unique(np.geomspace(1, level.size, 2000).astype(int)) - 1
+        curve.draw(ax, level, i, rows)
     ax.axhline(0.0, color=DISTURBANCE["color"], linewidth=1.0, zorder=1.5)
-    _over_time(ax, shown, f"Normalised squared error (dB)\nover {_window_in_words(window_s)}")
+    _over_time(ax, shown, f"{quantity} (dB)\nover {_window_in_words(window_s)}")
     if scale == "log":
         ax.set_xscale("log")
         ax.set_xlim(left=window_s / 5)  # before the first sound has come through the paths
@@ -254,7 +264,7 @@ def _window_in_words(window_s: float) -> str:
 def _over_time(ax: Axes, shown: list[Curve], label: str) -> Axes:
     """Label axes with a quantity over the time of whole runs, and return them."""
     ax.set_xlim(0, max(curve.run.n_samples / curve.run.fs for curve in shown))
-    return labelled(ax, xlabel="Time (s)", ylabel=label)
+    return labelled(ax, xlabel="Time since switch-on (s)", ylabel=label)
 
 
 def plot_run(result: SimulationResult) -> Figure:

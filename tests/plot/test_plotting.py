@@ -141,6 +141,13 @@ def test_the_window_of_the_nse_is_said_and_its_values_are_those_of_the_run(noise
     assert plotting.plot_nse(run, time_axis="log").get_ylabel().endswith("over 5 ms")
 
 
+def test_the_noise_reduction_is_the_nse_with_the_other_sign(noise):
+    error, reduction = (plotting.plot_nse(noise[0], noise_reduction=other) for other in (False, True))
+    np.testing.assert_array_equal(_line(reduction, "KF-OPC").get_ydata(), -_line(error, "KF-OPC").get_ydata())
+    assert reduction.get_ylabel() == "Noise reduction (dB)\nover 20 ms"
+    assert reduction.get_xlabel() == error.get_xlabel() == "Time since switch-on (s)"
+
+
 def test_output_power_against_the_rated_power(noise, tonal):
     ax = plotting.plot_output_power({"KF-OPC": noise}, window_s=0.25)
     assert _labels(ax) == ["KF-OPC", "Rated power 1"]
@@ -196,7 +203,7 @@ def test_a_run_draws_its_error_its_power_and_its_spectra(tonal, kind):
     level, power, spectra = figure.axes
     first = (run.error[0], run.disturbance[0]) if "several" in kind else (run.error, run.disturbance)
     require_nse(level, next(label for label in _labels(level) if label.startswith(run.algorithm)), *first)
-    assert [ax.get_xlabel() for ax in figure.axes] == ["Time (s)", "Time (s)", "Frequency (Hz)"]
+    assert [ax.get_xlabel() for ax in figure.axes] == [*2 * ["Time since switch-on (s)"], "Frequency (Hz)"]
     ratings = [label for label in _labels(power) if label.startswith("Rated")]
     assert ratings == {"several ratings": ["Rated power 0.5", "Rated power 1"], "diverged": []}.get(
         kind, ["Rated power 1"]
