@@ -65,7 +65,7 @@ class Consistency:
         lines = [f"NIS {self.nis_mean:.3g} for each measurement, {percent} within {low:.3g} to {high:.3g}{outside}"]
         first, bound = self.autocorrelation[0], self.autocorrelation_bounds[0]
         pace, size = ("slowly", "small") if first > 0 else ("fast", "large")
-        why = "" if abs(first) <= bound else f": follows too {pace}, Q is too {size} beside R"
+        why = "" if abs(first) <= bound else f": follows too {pace}, Q is too {size} relative to R"
         lines.append(f"correlation of neighbouring innovations {first:.2g}, {percent} within ±{bound:.2g}{why}")
         if self.nees is not None and self.nees_bounds is not None:
             low, high = self.nees_bounds
@@ -144,7 +144,7 @@ def consistency(
     ...     saver.save()
     >>> print(consistency(saver, truth=level[:, np.newaxis]))
     NIS 1.58 for each measurement, 95 % within 0.914 to 1.09: S is too small
-    correlation of neighbouring innovations 0.29, 95 % within ±0.062: follows too slowly, Q is too small beside R
+    correlation of neighbouring innovations 0.29, 95 % within ±0.062: follows too slowly, Q is too small relative to R
     NEES 11.2 for each state, 49 % of the samples within the 95 % bounds
     """
     y, there, S, x, P = _saved(saver if isinstance(saver, list | tuple) else [saver])

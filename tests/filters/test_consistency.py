@@ -99,8 +99,8 @@ def test_several_runs_tell_at_each_sample_and_a_wrong_filter_is_outside():
 @pytest.mark.parametrize(
     ("factor", "says"),
     [
-        (0.01, ("S is too small", "follows too slowly, Q is too small beside R")),
-        (100.0, ("S is too large", "follows too fast, Q is too large beside R")),
+        (0.01, ("S is too small", "follows too slowly, Q is too small relative to R")),
+        (100.0, ("S is too large", "follows too fast, Q is too large relative to R")),
     ],
 )
 def test_a_wrong_q_is_named(factor, says):
