@@ -346,7 +346,7 @@ def test_a_controller_with_a_longer_path_begins_as_if_nothing_had_been_played() 
         ({"controller": object()}, "controller must have control_signal"),
         (
             {"controller": kf_opc(8, PATH, rated_power=1.0, fs=16000, state_noise=1e-6, measurement_noise=1e-2)},
-            "fs is 8000 Hz but",
+            "the run is at 8000 Hz: make it with the fs of the run",
         ),
     ],
 )
