@@ -90,6 +90,7 @@ class RandomWalkKFOPC(KFOPC):
     """
 
     _in_place: ClassVar[tuple[str, ...]] = (*KFOPC._in_place, "_triangle")
+    _default_row: Any = None  # the H that filterpy makes; a filter that an earlier version saved has none
 
     x: Any = Assigned(_as_state)
     F: Any = Assigned(_as_multiple)
