@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 TEMPLATE = Path(__file__).with_name("verdict.html.jinja")
 NAME = "verdict"  # that the files beside the page begin with
-SINCE_SWITCH_ON = "Time since switch-on (s)"
 LOWEST_HZ = 20.0  # of the spectra, unless the noise is lower
 SWITCHED_ON = "The control is switched on {:g} s into the recording."
 CHAIN = (  # what each ceiling may use, and the cause if it is too low
@@ -94,14 +93,12 @@ def _run_figures(verdict: Assessment) -> Iterator[FigureItem]:
     caption = f"Spectra without control and of the errors, over the steady half.{together}"
     yield FigureItem("spectra", caption, ax.figure)
     ax = plot_nse(runs)
-    ax.set_xlabel(SINCE_SWITCH_ON)
     caption = "Error power over that of the disturbance; below 0 dB it is quieter than without control."
     yield FigureItem("nse", f"{caption}{together} {begin}", ax.figure)
 
     def power(j: int, ax: Any) -> None:
         watt = None if watt_per_power is None else np.ravel(watt_per_power)[j]
         plot_output_power(runs, channel=j, rated_power=np.ravel(rated_power)[j], watt_per_power=watt, ax=ax)
-        ax.set_xlabel(SINCE_SWITCH_ON)
 
     figure = _one_below_another(np.size(rated_power), "Loudspeaker", (6.4, 4), power)
     yield FigureItem("power", f"Mean power of the control signal, and the rated power. {begin}", figure)
