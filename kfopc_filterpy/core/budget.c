@@ -36,8 +36,9 @@ enum { SHORTER = 5 };
 static const real GROWTH = 10;
 /* Steps of conjugate gradients towards filters. */
 enum { FILTER_STEPS = 12 };
-/* Share of a path's gain that filters of few taps have in directions of which spectra have none. */
-static const real LEAK = (real)1e-4;
+/* Share of a path's gain that short filters leak into directions in which its spectra have none.
+ * With less, filters follow a price slowly there; with more, prices swing. */
+static const real LEAKED = (real)1e-4;
 /* No filter has a larger tap. REGULAR: share of the powers of x that is added to them, and of the
  * paths' gains that is added to the prices, so that rounding leaves the matrix definite. */
 #ifdef ANC_FLOAT
@@ -62,7 +63,7 @@ typedef struct {
     real *lags;               /* (I, I, N) of the window, into which the newest block fades in */
     real *R_at, *smooth_R;    /* (I, I) spectra: of the lags, of a circulant near to them */
     real *SS, *gain;          /* (J, J) spectra of the secondary paths; (J) mean of the diagonal */
-    real *factor;             /* (J, I, J, I) spectra: of a matrix near to A + price R */
+    real *factor;             /* (J, I, J, I) spectra: factor of a matrix near to A + price R */
     real *b;                  /* (J, I, L) */
     real *spectra, *products; /* (J, I), (J, I) spectra */
     real *vectors;            /* (4, J, I, L) */
@@ -199,7 +200,7 @@ static void add_block(budget *f, real *sums, real slow, int fades_in)
             f->window[times(i, length) + (size_t)t] =
                 share * fade_in * history_of(&f->posterior, i)[t];
     }
-    add_all_lags(&f->posterior.fourier, sums, f->window, f->window, I, length, B, N);
+    add_all_lags(&f->posterior.fourier, sums, f->window, I, length, B, N);
 }
 
 /* Add the block to the window of the references. Set the lags to those of a window into which the
@@ -302,9 +303,10 @@ static void precondition_filters(void *self, real *to, const real *r)
     solve_circulants(&f->posterior.fourier, f->factor, f->spectra, to, r, f->s.J * f->s.I, f->s.L);
 }
 
-/* Factorise (SS + price) R at each frequency, with a smooth R. With more loudspeakers than
- * microphones, SS leaves directions of v open, in which A has nearly nothing, nor has this matrix:
- * only the price decides there. */
+/* Factorise (SS + price + leak) R at each frequency, with a smooth R. With more loudspeakers than
+ * microphones, SS leaves directions of v open, as A nearly does: the price and the leak decide
+ * there.
+ */
 static void factorise_filters(budget *f)
 {
     const int32_t I = f->s.I, J = f->s.J;
@@ -315,7 +317,7 @@ static void factorise_filters(budget *f)
             const real *R = f->smooth_R + times(i * I + c, F->F);
             real *at = f->factor + times(ji * J * I + ac, F->F);
             multiply_rows(F, at, f->SS + times(j * J + a, F->F), R, 1, 1);
-            if (j == a) add_scaled(at, f->price[j] + LEAK * f->gain[j], R, F->F);
+            if (j == a) add_scaled(at, f->price[j] + LEAKED * f->gain[j], R, F->F);
         }
     factorise_spectra(F, f->factor, J * I);
 }
@@ -351,7 +353,7 @@ static void set_powers(budget *f, real *power)
     }
 }
 
-/* Set the sums over a of |u_j'A^-1 u_a|, with the preconditioner in place of A. */
+/* Set the sums over a of |u_j'A^-1 u_a|, with the preconditioner in place of A + price R. */
 static void set_slopes(budget *f, real *slope)
 {
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;

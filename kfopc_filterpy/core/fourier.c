@@ -193,12 +193,12 @@ void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *
     }
 }
 
-void add_all_lags(const fourier *f, real *to, const real *u, const real *v, int32_t C, int32_t row,
-                  int32_t n, int32_t lags)
+void add_all_lags(const fourier *f, real *to, const real *u, int32_t C, int32_t row, int32_t n,
+                  int32_t lags)
 {
     for (int32_t a = 0; a < C; a++)
         for (int32_t c = 0; c < C; c++)
-            add_lags(f, to + times(a * C + c, lags), u + times(a, row), n, v + times(c, row), lags);
+            add_lags(f, to + times(a * C + c, lags), u + times(a, row), n, u + times(c, row), lags);
 }
 
 void transform_lags(const fourier *f, real *spectrum, const real *ahead, const real *behind,

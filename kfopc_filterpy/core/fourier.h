@@ -13,7 +13,8 @@ typedef struct {
     real *work;      /* (5, F) of a transform, and of sums at lags */
 } fourier;
 
-/* Return a row of the scratch memory. Transforms use the first two, sums at lags all five. */
+/* Return a row of the scratch memory. Transforms use the first two, a factorisation the third, sums
+ * at lags all five. */
 static inline real *scratch_row(const fourier *f, int32_t row)
 {
     return f->work + times(row, f->F);
@@ -25,15 +26,17 @@ void start_fourier(const fourier *f);
 void transform(const fourier *f, real *spectrum, const real *from, int32_t n);
 /* Set `to` to the first n of the F numbers of a spectrum; n <= F. */
 void transform_back(const fourier *f, real *to, const real *spectrum, int32_t n);
-/* The same for rows of taps and as many spectra. */
+/* The same for n rows of `taps` numbers. */
 void transform_rows(const fourier *f, real *spectra, const real *rows, int32_t n, int32_t taps);
 void transform_rows_back(const fourier *f, real *rows, const real *spectra, int32_t n,
                          int32_t taps);
 /* Add sum_k u(k) v(k + l), k < n, to to_l, l < lags; v has n + lags - 1 numbers. */
 void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *v, int32_t lags);
-/* The same for all pairs of two times C rows of u and v: `to` is (C, C, lags). */
-void add_all_lags(const fourier *f, real *to, const real *u, const real *v, int32_t C, int32_t row,
-                  int32_t n, int32_t lags);
+/* The same for each row of u with each other and itself, C rows of this length; `to` is (C, C,
+ * lags).
+ */
+void add_all_lags(const fourier *f, real *to, const real *u, int32_t C, int32_t row, int32_t n,
+                  int32_t lags);
 /* Set a spectrum to that of ahead_l at lags l and behind_l at lags -l, l < n, under a triangle that
  * ends at lag n if `smooth`: then a definite Toeplitz matrix gives a definite circulant near to it,
  * as that of T. Chan, SIAM J. Sci. Stat. Comput. 9 (1988) 766. */
@@ -61,7 +64,7 @@ static inline void add_white(const fourier *f, real *spectrum, real power)
 {
     for (int32_t k = 0; k < f->half; k++) spectrum[k] += power;
 }
-/* Set `to` to the first rows of the matrix times n spectra x. */
+/* Set `to` to a matrix, (rows, n), times n spectra x; `to` is not x. */
 void multiply_rows(const fourier *f, real *to, const real *A, const real *x, int32_t rows,
                    int32_t n);
 /* Factorise the lower triangle of a Hermitian matrix in place, at each frequency; the diagonal

@@ -142,11 +142,10 @@ static int set_precisions(posterior *f)
     real x2 = 0, e2 = 0, q = 0;
     for (int32_t i = 0; i < f->I; i++) x2 += f->T[times(i * f->C + i, f->N)];
     for (int32_t k = 0; k < f->K; k++) {
-        if (!(f->ee[k] > 0)) return 0;
         e2 += f->ee[k];
         q += f->q[k];
     }
-    if (!(x2 > 0)) return 0;
+    if (!(x2 > 0 && e2 > 0)) return 0;
     const real spread = known->spread;
     known->precision_s = f->exact ? 0 : (real)f->M / (spread * spread * size_of_path(f));
     known->precision = x2 * (real)f->N * (real)f->K / (e2 + known->explained);
@@ -417,7 +416,7 @@ static void begin_data(posterior *f, int32_t newest)
             before[N - 2 - i] = turned[i] =
                 (c < f->I ? 1 : -1) * f->taper[i] * history_of(f, c)[newest + i];
     }
-    add_all_lags(&f->fourier, f->T, reversed, reversed, C, 2 * N, N, N);
+    add_all_lags(&f->fourier, f->T, reversed, C, 2 * N, N, N);
 }
 
 /* Let numbers fade. */
@@ -451,7 +450,7 @@ static void add_samples(posterior *f, int32_t newest, int believed, real expecte
     let_fade(f->T, times(C * C, N), share);
     let_fade(f->r, times(f->K * C, N), share);
     let_fade(taps_of(f, f->r, f->K, 0), times((f->rows - f->K) * C, N), root(share));
-    add_all_lags(&f->fourier, f->T, f->faded, f->faded, C, f->history, newest, N);
+    add_all_lags(&f->fourier, f->T, f->faded, C, f->history, newest, N);
     for (int32_t row = 0; row < f->rows; row++) {
         hear_row(f, row, newest, believed, heard);
         for (int32_t c = 0; c < C; c++)
@@ -547,7 +546,7 @@ static real energy_of_block(const posterior *f, int32_t begin, int32_t end)
 static int noise_has_gone(const posterior *f, const judgement *is)
 {
     const real noise = mean_noise(f) * count_of(f, f->B) * (real)f->K;
-    return 2 * f->numbers->significant < 1 && LOUDER * LOUDER * is->missed < noise;
+    return 2 * f->numbers->significant < 1 && LOUDER * LOUDER * is->missed < noise && is->heard > 0;
 }
 
 /* Learn from the newest samples of a block; 0: its errors are not known. */
@@ -563,8 +562,8 @@ static void learn_samples(posterior *f, int32_t newest, real forget)
     const real x2 = energy_of_block(f, 0, f->I), y2 = energy_of_block(f, f->I, f->C);
     const real x2_of_data = energy_of_data(f, 0, f->I), y2_of_data = energy_of_data(f, f->I, f->C);
     if (believed) {
-        const int noise_gone = known && noise_has_gone(f, &is);
-        if (noise_gone) clear(f->q, (size_t)f->K);
+        const int noise_gone = known && x2 > 0 && noise_has_gone(f, &is);
+        if (noise_gone) clear(f->q, (size_t)f->K); /* it is guessed anew */
         if (noise_gone || x2 > LOUDER * x2_of_data)
             begin_data(f, believed); /* what the data told is little */
         add_samples(f, believed, 1, is.expected, forget);

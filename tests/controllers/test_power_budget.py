@@ -221,6 +221,33 @@ def test_a_slam_beside_the_microphone_leaves_no_mark() -> None:
     assert abs(reduced[1] - reduced[0]) < 0.5
 
 
+def test_a_muted_microphone_is_no_noise_that_has_gone() -> None:
+    """Its zeros tell nothing: no alarm, and what was learned in a loud noise stays."""
+    x = noise(3.0)
+    d = lfilter(PRIMARY, 1.0, x) + 3.0 * noise(3.0, 1)
+    mute = slice(round(0.15 * FS), round(0.4 * FS))
+    controller = made()
+    simulate(controller, x[: mute.start], Plant(S, fs=FS), disturbance=d[: mute.start])
+    learned = np.sum(controller.primary_path**2)
+    assert learned > 0.0
+    for n in range(mute.start, mute.stop):
+        controller.control_signal(float(x[n]))
+        controller.update(0.0)
+    assert np.sum(controller.primary_path**2) > 0.0
+    simulate(controller, x[mute.stop :], Plant(S, fs=FS), disturbance=d[mute.stop :])
+    assert controller.alarms == 0
+
+
+def test_a_dead_microphone_does_not_keep_the_others_from_control() -> None:
+    x = noise(4.0)
+    d = np.stack([lfilter(PRIMARY, 1.0, x), 0.0 * x])
+    s = np.stack([S, 0.0 * S])[:, np.newaxis]
+    d[0] += 0.01 * noise(4.0, 1)
+    run = simulate(kf_pb(L, s, rated_power=2.0, fs=FS, averaging_s=AVERAGING_S), x, Plant(s, fs=FS), disturbance=d)
+    later = slice(round(2 * FS), None)
+    assert noise_reduction_db(run.error[0, later], d[0, later], steady=1.0) > 10.0
+
+
 @pytest.mark.parametrize(("seed", "share"), [(3, 0.6), (4, 0.9), (7, 0.6)])
 def test_two_loudspeakers_and_one_microphone_share_the_work(seed: int, share: float) -> None:
     """They can exchange it at no cost: with a preconditioner that leaked, prices swung, and 25 dB were missing."""

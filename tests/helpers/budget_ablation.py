@@ -42,7 +42,7 @@ WITHOUT = {  # the value that takes a constant out of effect, or makes it as sma
     "SHORTER": "1",
     "GROWTH": "1e30",
     "FILTER_STEPS": "1",
-    "LEAK": "1e-7",  # no more than what keeps rounding away
+    "LEAKED": "1e-7",  # no more than what keeps rounding away
     "DRAWS": "2",
     "LOUDER": "1e30",
     "SURPRISE": "1e9",

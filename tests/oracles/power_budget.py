@@ -163,7 +163,8 @@ class Plant:
         if new and known:
             missed = np.mean((e - d - self.theta[:K, self.split :] @ Z[:, self.split :].T) ** 2, axis=0)
             new = new if self.believes(missed, np.sum(d**2) / (K * np.sum(w**2)), heard, z, Z, w) else 0
-            noise_gone = self.significant < 0.5 and core.LOUDER**2 * np.sum(missed) < np.mean(self.q) * np.sum(w**2)
+            quiet = core.LOUDER**2 * np.sum(missed) < np.mean(self.q) * np.sum(w**2)
+            noise_gone = self.significant < 0.5 and quiet and heard > 0 and np.any(Z[:, : self.split])
         x2, y2 = (np.sum((z[part, -self.B :] * w) ** 2) for part in (slice(I), slice(I, None)))
         x2_of_data, y2_of_data = self.energy_of(slice(I)), self.energy_of(slice(I, None))
         if new:
@@ -219,7 +220,7 @@ class Plant:
         """Take some steps towards (G + q P) theta = r + q P mean, and estimate q; return False if nothing can be told."""
         K, N, split, I, T = self.K, self.N, self.split, self.split // self.N, self.T  # noqa: E741
         x2 = self.energy_of(slice(I)) / I
-        if not (x2 > 0 and np.all(self.ee > 0)):
+        if not (x2 > 0 and np.sum(self.ee) > 0):
             return False
         if not np.any(self.q):
             self.q = 1e-3 * self.ee / self.count
@@ -419,7 +420,7 @@ class PowerBudget(Controller):
 
     def solved(self, price, v):
         """Return filters after some steps from v towards those at the prices."""
-        priced, leaking = (np.diag(price + share * self.gain)[..., None] for share in (core.REGULAR, core.LEAK))
+        priced, leaking = (np.diag(price + share * self.gain)[..., None] for share in (core.REGULAR, core.LEAKED))
         lags, L = self.A_lags + np.kron(priced, self.R_lags), self.w.shape[2]
         near = np.einsum("jaf,icf->jiacf", self.SS + leaking, spectra(self.R_lags, L)[0])
         self.W = preconditioner(near.reshape(lags.shape), self.turn, L)
