@@ -66,7 +66,7 @@ class RandomWalkKFOPC(KFOPC):
     - `F`, `Q` and `R` are returned as read-only arrays. Assign a number to `Q` or `R` to change the noise.
     - What is written into `P` counts at the next step, as in filterpy. A `P` that is not symmetric and positive
       semidefinite is refused then, which costs O(L^3), but only after `P` was assigned or written into.
-    - `update` needs an `H`, passed or assigned: the default, zeros, would correct nothing.
+    - The default `H` is zeros, as in filterpy, and corrects nothing: pass another one to `update`, or assign it.
     - If another F or a full Q is assigned or passed, or with `B` and `u`, or an H of several rows, the step uses
       filterpy's own equations, in O(L^3).
 
@@ -90,7 +90,6 @@ class RandomWalkKFOPC(KFOPC):
     """
 
     _in_place: ClassVar[tuple[str, ...]] = (*KFOPC._in_place, "_triangle")
-    _default_row: Any = None  # the H that filterpy makes; a filter that an earlier version saved has none
 
     x: Any = Assigned(_as_state)
     F: Any = Assigned(_as_multiple)
@@ -119,7 +118,6 @@ class RandomWalkKFOPC(KFOPC):
         self._blurred = False  # h'P h was nothing but rounding
         self._predicted = False  # P is P_prior
         self._gain, self._last = np.zeros(n_taps), (0.0, 0.0, 0.0)  # K of the last update; its z, y and S
-        self._default_row = self.H
         del self.__dict__["P"]
 
     # The steps.
@@ -225,11 +223,6 @@ class RandomWalkKFOPC(KFOPC):
             z = None if np.ma.is_masked(z) else z.data
         if z is None or self.inv is not inv or np.size(row) != n:
             return None
-        if row is self._default_row and not row.any():
-            raise ValueError(
-                "H is not known: pass update(z, H=...), the newest filtered reference samples, or assign kf.H. The default, "
-                "zeros, corrects nothing. Nothing was changed"
-            )
         usual_z = isinstance(z, float) or (type(z) is np.ndarray and z.dtype == FLOAT and z.shape in ((), (1,), (1, 1)))
         usual_H = type(row) is np.ndarray and row.dtype == FLOAT and row.shape in ((n,), (1, n))
         if not usual_z or not usual_H or R is not None:

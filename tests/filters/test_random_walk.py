@@ -157,20 +157,18 @@ def test_without_any_noise_what_is_known_exactly_tells_nothing() -> None:
 # F, Q, R and H as a user meets them; P is in the machine
 
 
-def test_an_update_before_any_H_is_refused_but_a_silent_one_is_not() -> None:
-    kf = KFOPC.random_walk(3, state_noise=0.1, measurement_noise=0.5)
-    twin = copy.deepcopy(kf)
-    for f in (kf, copy.deepcopy(kf)):
-        with pytest.raises(ValueError, match=r"H is not known: pass update\(z, H=\.\.\.\).*assign kf\.H"):
-            f.update(1.0)
-    for f in (kf, twin):
-        f.update(None)
-        f.update(1.0, H=np.zeros(3))
-    kf.H = np.zeros((1, 3))
-    kf.update(1.0)
-    twin.H[0, 0] = 1.0  # written into the default
-    twin.update(1.0)
-    assert (kf.x.any(), twin.x.any()) == (False, True)
+def test_rows_written_into_H_count_and_silent_ones_correct_nothing() -> None:
+    """At the start too: zeros written into H are those of filterpy's default."""
+    signal = np.r_[np.zeros(5), np.random.default_rng(0).normal(size=8), np.zeros(5), 1.0]
+    filters = pair(3, 0.1, 0.5, 1.0)
+    for k in range(3, signal.size + 1):
+        for kf in filters:
+            before = kf.x.copy()
+            kf.predict()
+            kf.H[0] = signal[k - 3 : k][::-1]
+            kf.update(1.0)
+            assert np.array_equal(kf.x, before) == (not kf.H.any()), k
+    np.testing.assert_allclose(filters[1].x, filters[0].x, rtol=1e-10)
 
 
 @pytest.mark.parametrize("name", ["F", "Q", "R"])
