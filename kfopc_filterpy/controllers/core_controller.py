@@ -375,9 +375,9 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
     def _read_rated_power(self) -> Any:
         return self._of_constraint("rated_power", self._own_constraint) if self._constrained else None
 
-    def _take_rated_power(self, value: Any) -> None:
-        """Use another rated power, a number or (J,)."""
-        for constraint, power in zip(np.atleast_1d(self._own_constraint), np.atleast_1d(value), strict=True):
+    def _take_rated_power(self, value: np.ndarray) -> None:
+        """Use another rated power of each loudspeaker, (J,)."""
+        for constraint, power in zip(np.atleast_1d(self._own_constraint), value, strict=True):
             constraint.rated_power = power
 
     # What can be read.

@@ -85,8 +85,8 @@ class KalmanController(CoreController):
     def _read_rated_power(self) -> float | None:
         return getattr(self.estimator, "rated_power", None)
 
-    def _take_rated_power(self, value: float) -> None:
-        self.estimator.rated_power = value
+    def _take_rated_power(self, value: np.ndarray) -> None:
+        self.estimator.rated_power = value.item()  # a user's filter may keep it as it comes
 
     @property
     def weights(self) -> np.ndarray:

@@ -91,7 +91,7 @@ class PowerBudgetInCore(CoreController):
     def _read_rated_power(self) -> Any:
         return self._of_setting("rated_power")
 
-    def _take_rated_power(self, value: Any) -> None:
+    def _take_rated_power(self, value: np.ndarray) -> None:
         """Use another rated power; what was spent before still counts relative to the old one."""
         self._block.fields["rated_power"].ravel()[:] = value
 

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 from helpers.simulation import Integrator
 
 from kfopc_filterpy import (
+    KalmanController,
     LimitedController,
     OutputLimiter,
     Plant,
@@ -64,6 +66,17 @@ def test_a_rated_power_that_is_assigned_counts_like_the_first_one(name: str) -> 
     np.testing.assert_array_equal(made.rated_power, power)
     np.testing.assert_array_equal(control_signal(changed), control_signal(made))
     assert not np.array_equal(control_signal(made), control_signal(first))
+
+
+def test_a_users_filter_gets_its_rated_power_as_a_number() -> None:
+    class Rated(KalmanFilter):
+        rated_power = 1.0
+
+    controller = KalmanController(Rated(4, 1), PATH)
+    for value in (2.0, [3.0]):
+        controller.rated_power = value
+        assert type(controller.rated_power) is float
+    assert controller.rated_power == 3.0
 
 
 def test_a_controller_without_a_rated_power_takes_none() -> None:
