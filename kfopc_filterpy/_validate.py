@@ -57,7 +57,8 @@ def as_real_array(value: Any, name: str) -> np.ndarray:
 
 def _kind_of(value: Any) -> str:
     """Return the name of the type of a value, and how to read a file whose path was given in place of its content."""
-    is_file = isinstance(value, str | os.PathLike) and Path(value).suffix
+    suffix = Path(value).suffix if isinstance(value, str | os.PathLike) else ""
+    is_file = suffix[1:2].isalpha()  # no digit, as in "1.5"
     remedy = ": read the file with paths.read_path (impulse responses) or signals.read_recording" if is_file else ""
     return type(value).__name__ + remedy
 
@@ -176,7 +177,7 @@ def per_channel(
     value: Any, size: int, what: str, name: str, check: Callable[[Any, str], float] = as_positive
 ) -> np.ndarray:
     """Return one number, or one for each channel, as (size,); each must pass `check`. `what` names the channels."""
-    if np.ndim(value) == 0:
+    if isinstance(value, str) or not np.iterable(value):
         return np.full(size, check(value, name))
     numbers = as_real_array(value, name)
     if numbers.shape != (size,):

@@ -54,6 +54,7 @@ def test_what_is_taken():
         (as_real_array, [1j], TypeError, "x must be a sequence of real numbers, got complex ones"),
         (as_real_array, [1.0, "a"], TypeError, "x must be a sequence of real numbers"),
         (as_real_array, "abc", TypeError, "x must be a sequence of real numbers, got str$"),
+        (as_real_array, "1.5e-3", TypeError, "x must be a sequence of real numbers, got str$"),
         (
             as_real_array,
             Path("a.wav"),
@@ -86,6 +87,12 @@ def test_what_is_taken():
             ValueError,
             r"for 1 loudspeaker, got shape \(2,\)",
         ),
+        (
+            lambda value, name: per_loudspeaker(value, 2, name),
+            [[1.0], [1.0, 2.0]],
+            TypeError,
+            "x must be .* whose rows differ in length",
+        ),
         (lambda value, name: per_loudspeaker(value, 2, name), "2 W", TypeError, "x must be a single number, got '2 W'"),
         (lambda value, _: pair(value), 100.0, ValueError, r"band must be a pair \(low, high\)"),
         (lambda value, _: pair(value), (-1.0, 5.0), ValueError, "band must satisfy"),
@@ -97,7 +104,7 @@ def test_what_is_taken():
         (lambda value, name: as_sample_count(1.0, value, name), 0, ValueError, "fs must be greater than 0 Hz"),
         (lambda value, _: as_generator(value), None, TypeError, "rng must be a seed or a numpy.random.Generator"),
     ],
-    ids=range(41),
+    ids=range(43),
 )
 def test_what_is_refused(check, value, error, message):
     with pytest.raises(error, match=message):

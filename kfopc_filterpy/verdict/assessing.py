@@ -378,7 +378,7 @@ def _recording(value: Any, name: str, fs: float, length: int | None = None) -> n
 
 def _pascals(value: Any, n_microphones: int) -> Any:
     """Return pascals per unit, of all microphones or as a column of them."""
-    if np.ndim(value) == 0:
+    if not np.iterable(value):
         return as_positive(value, "pascal_per_unit", unit="Pa")
     return per_channel(value, n_microphones, "microphones", "pascal_per_unit")[:, np.newaxis]
 
