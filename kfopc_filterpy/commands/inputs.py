@@ -258,7 +258,8 @@ def _rating(own: argparse.Namespace) -> list[Any]:
             "secondary path was measured with, or --rated-power in place of watts"
         )
     if not ratings:
-        raise ValueError("a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6")
+        volts = " --volts-per-unit 10" if own.volts_per_unit is None else ""
+        raise ValueError(f"a rating is needed: --watt 20 --ohm 8{volts}, or --rated-power 1.6")
     refuse_unused(
         own,
         [name for name in vars(own) if name not in used],

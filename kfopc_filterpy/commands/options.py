@@ -115,7 +115,10 @@ def add_recorded_scene(parser: argparse._ActionsContainer) -> None:
         help="signal with which the watts were measured (default: sine, which is on the safe side)",
     )
     add_number(rating, "--peak-volts", "V", help="voltage at which the amplifier clips", **each)
-    about = "volts for a control signal of 1, with which the secondary path was measured; all ratings in W or V need it"
+    about = (
+        "volts for a control signal of 1, with which the secondary path was measured; ratings in W or V need it, unless the "
+        "path's file is in Pa/V"
+    )
     add_number(rating, "--volts-per-unit", "V", help=about, **each)
     add_number(rating, "--rated-power", "", metavar="P", help="rated power as mean square, in place of watts", **each)
     add_number(rating, "--loudspeaker-watt", "W", help="rated noise power of the loudspeaker", **each)

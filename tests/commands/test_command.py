@@ -26,7 +26,8 @@ ERRORS = {
     "verdict noise.wav PATHS --rated-power 1 --tap 8": "unrecognized arguments: --tap 8; see kfopc verdict --help",
     "paths inspect S.wav --bogus 3": "unrecognized arguments: --bogus 3; see kfopc paths inspect",
     # Ratings.
-    "verdict noise.wav PATHS": "a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6",
+    "verdict noise.wav PATHS": "a rating is needed: --watt 20 --ohm 8 --volts-per-unit 10, or --rated-power 1.6",
+    "verdict noise.wav PATHS --volts-per-unit 2": "a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6",
     "verdict noise.wav PATHS --watt 20": "need --ohm",
     "verdict noise.wav PATHS --watt 20 --ohm 8 --rated-power 1": "leave out one of them",
     "verdict noise.wav PATHS --watt twenty --ohm 8": "--watt must be a single number in W, got 'twenty'",
