@@ -30,9 +30,10 @@ def amplifiers_in(path: str) -> list[list[Any]]:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is not text: save the list as CSV in UTF-8") from error
-    decimal, delimiter = (",", ";") if ";" in lines[0] else (".", ",")
-    rows = csv.reader(lines, delimiter=delimiter)
-    headings, places = [cell.strip().lower() for cell in next(rows)], []
+    decimal, delimiter = (",", ";") if ";" in next(filter(str.strip, lines), "") else (".", ",")
+    reader = csv.reader(lines, delimiter=delimiter)
+    rows = (row for row in reader if any(map(str.strip, row)))  # spreadsheets end with rows of empty cells
+    headings, places = [cell.strip().lower() for cell in next(rows, [])], []
     for column in COLUMNS:
         if not (there := [i for i, heading in enumerate(headings) if heading.startswith(column)]):
             raise ValueError(
@@ -41,8 +42,9 @@ def amplifiers_in(path: str) -> list[list[Any]]:
         places.append(there[0])
 
     def amplifier(row: list[str]) -> list[Any]:
-        where = f"{path}, line {rows.line_num}"
-        if len(row) != len(headings):
+        where = f"{path}, line {reader.line_num}"
+        is_split = decimal == "." and any(map(str.strip, row[len(headings) :]))  # 1,5 has become two cells
+        if is_split or len(row) <= max(places):
             raise ValueError(f"{where} must have {len(headings)} cells, as the headings, got {len(row)}")
         name, *cells = (row[place].strip() for place in places)
         numbers = []
@@ -54,7 +56,7 @@ def amplifiers_in(path: str) -> list[list[Any]]:
             numbers.append((as_number if column == "price" else as_positive)(number, f"{where}: {column}"))
         return [name, *numbers]
 
-    found = [amplifier(row) for row in rows if row]
+    found = [amplifier(row) for row in rows]
     if not found:
         raise ValueError(f"{path} lists no amplifier below its headings")
     return sorted(found, key=lambda one: one[3])

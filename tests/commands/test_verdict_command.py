@@ -20,6 +20,7 @@ from helpers.commands import FS, ROOT, SCENE, process
 
 from kfopc_filterpy import Plant, verdict
 from kfopc_filterpy.commands import main
+from kfopc_filterpy.commands.amplifiers import amplifiers_in
 from kfopc_filterpy.commands.inputs import calibration_of
 from kfopc_filterpy.controllers.kf_pb import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance
@@ -119,6 +120,8 @@ def test_of_a_list_of_amplifiers_the_cheapest_that_is_enough_is_first(command, f
             "list.csv has no column 'price': its first line must have the headings name, watt, ohm, price\n",
         ),
         ("\n", [], "list.csv has no column 'name'"),
+        ("", [], "list.csv is empty (0 bytes)"),
+        ("\ufeff", [], "list.csv has no column 'name'"),
         ("name,watt,ohm,price\nA,ten,8,50\n", [], "list.csv, line 2: watt is 'ten', not a number\n"),
         ("name,watt,ohm,price\nB,1,8,5\n\nA,1,8,nan\n", [], "list.csv, line 4: price must be finite, got nan"),
         ("name,watt,ohm,price\nA,-1,8,5\n", [], "list.csv, line 2: watt must be greater than 0, got -1"),
@@ -133,10 +136,24 @@ def test_of_a_list_of_amplifiers_the_cheapest_that_is_enough_is_first(command, f
     ],
 )
 def test_a_list_of_amplifiers_that_is_wrong_is_refused(command, folder, text, more, message):
-    (folder / "list.csv").write_text(text)
+    (folder / "list.csv").write_text(text, encoding="utf-8")
     code, _, err = command("verdict", *SCENE, "--amplifiers", "list.csv", *more)
     assert code == 2
     assert message in err
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\n\nname,watt,ohm,price,note\nA,1,8,5\n,,,,\n",
+        "\n;;;\nname;watt;ohm;price\nA;1,0;8;5;good\n",
+        "name,watt,ohm,price\nA,1,8,5,\n",
+    ],
+    ids=["blank lines, a cell less", "semicolons, a cell more", "an empty cell more"],
+)
+def test_a_list_of_amplifiers_needs_only_its_columns(tmp_path, text):
+    (tmp_path / "list.csv").write_text(text)
+    assert amplifiers_in(tmp_path / "list.csv") == [["A", 1.0, 8.0, 5.0]]
 
 
 def test_a_verdict_names_options_in_its_advice_and_on_its_page(command, tmp_path):
