@@ -21,6 +21,7 @@ UNRELATED, CHANCE = 0.02, 3.0  # a path must explain this share of a response, a
 POOR_DB = -20.0  # a warning is printed if more of the response is left unexplained
 EXCITED_DB = -40.0  # of the strongest part of an excitation's spectrum: below, a microphone mostly hears other noise
 LOWEST_HZ, NARROW = 20.0, 8.0  # an excited band is narrow below three octaves, as from 125 to 1000 Hz
+WHOLE = 0.4  # of the sampling rate: from LOWEST_HZ up to there is the whole band, however few octaves it has
 
 
 def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
@@ -69,7 +70,7 @@ def identify(options: argparse.Namespace) -> int:
     low_hz, high_hz = _excited_band(sent, files.fs)
     found = estimate_path(sent[:shortest], heard[:shortest], options.taps, files.fs)
     _judge_residual(options, found.residual_db, files.fs, sent[:shortest], heard[:shortest])
-    if high_hz < NARROW * max(low_hz, LOWEST_HZ):
+    if high_hz < max(NARROW * low_hz, min(NARROW * LOWEST_HZ, WHOLE * files.fs)):
         warn(
             options,
             f"{options.excitation} excites the path from {low_hz:.0f} to {high_hz:.0f} Hz only: elsewhere the impulse response "

@@ -50,6 +50,16 @@ def test_the_band_in_which_a_path_is_known_is_told(command, folder, tmp_path, lo
     assert [f"{facts[f'excited_{edge}_hz']:.0f}" for edge in ("low", "high")] == edges
 
 
+def test_noise_of_the_whole_band_is_not_narrow_at_a_low_rate(command, folder, tmp_path):
+    sent = np.random.default_rng(3).standard_normal(3001)
+    for name, signal in (("sent.txt", sent), ("received.txt", np.convolve(sent, np.eye(16)[5])[: sent.size])):
+        np.savetxt(folder / name, signal)
+    fit = ["paths", "identify", "sent.txt", "received.txt", "--taps", 16, "-o", tmp_path / "S.npy", "--file-fs"]
+    code, out, err = command(*fit, 250)
+    assert (code, err) == (0, "")
+    assert "excited from 0 to 125 Hz" in out
+
+
 def test_files_that_a_path_does_not_explain_are_refused_and_nothing_is_written(command, folder, tmp_path):
     write_wav(folder / "other.wav", band_limited_noise((100, 1500), 3.0, fs=FS, rng=2), FS)
     code, out, err = command("paths", "identify", "noise.wav", "other.wav", "--taps", 24, "-o", tmp_path / "S.wav")
