@@ -245,8 +245,8 @@ def summarize(report: RunReport, fs: float, block: int, asked_s: float | None = 
     lines += [
         f"noise reduction {reductions} dB over the second half, relative to the silence before",
         f"output power {_powers(report, ' of the rated power')}",
-        f"{report.overruns} of {report.blocks} blocks took longer than their duration, the longest {100 * report.load:.0f} % "
-        f"of it; {report.lost} samples lost, {report.underflows} blocks too late for the output",
+        f"the longest of {report.blocks} blocks took {100 * report.load:.0f} % of its duration; {report.lost} samples lost, "
+        f"{report.underflows} blocks too late for the output",
         f"health: {_noticed(report) or 'nothing noticed'}",
         *(f"  {fault}" for fault in faults[-LATEST:]),
     ]
