@@ -5,7 +5,6 @@ from importlib.util import find_spec
 if missing := [
     name for name in ("adafilt", "joblib", "padasip", "pooch", "pyroomacoustics") if find_spec(name) is None
 ]:
-    raise ImportError(
-        f"the studies need {', '.join(missing)}: install the extra `studies` in the clone, "
-        'python -m pip install -e ".[studies]"'
-    )
+    from kfopc_filterpy._validate import how_to_install
+
+    raise ImportError(f"the studies need {', '.join(missing)}: {how_to_install('studies')}")
