@@ -90,19 +90,19 @@ def test_a_change_is_what_its_name_says(what: str, signal: str, later: np.ndarra
 
 
 @pytest.mark.parametrize(
-    "name",
+    ("name", "loudest_db"),
     [
-        "primary path's sign at 1 s",
-        "noise 12 dB softer",
-        "a reference sample of 1e4",
-        "another noise, 30 dB louder, for 1 s",
+        ("primary path's sign at 1 s", 0.0),
+        ("noise 12 dB softer", 0.0),
+        ("a reference sample of 1e4", 0.0),
+        ("another noise, 30 dB louder, for 1 s", 0.01),  # nothing cancels it
     ],
 )
-def test_the_bound_is_reached_two_seconds_after(name: str) -> None:
+def test_the_bound_is_reached_two_seconds_after(name: str, loudest_db: float) -> None:
     """The sign of a path, an easier noise, a click and a slam: what each cost KF-PB 5 dB and more for seconds before."""
     row = study.event_row(name)
     assert max(row.lost_db[2:6]) < 0.5
-    assert row.loudest_second_db < 0.01
+    assert row.loudest_second_db < loudest_db
     assert row.loudest_tenth_db < 3.0
     assert row.power < 1.02
 
