@@ -281,7 +281,7 @@ def assess(
     if disturbance is not None:
         notes += clipping_remarks(disturbance, "disturbance") + _on_differing_path(noise, plant, disturbance)
     elif p is not None:
-        lacking = "shows only the plant's sensor noise" if plant.sensor_noise_std else "is not checked"
+        lacking = "is not checked" if coherence_db is None else "shows only the plant's sensor noise"
         notes.append(
             f"The disturbance was computed from the reference, so the coherence {lacking}: record both microphones "
             "together and give the disturbance."
