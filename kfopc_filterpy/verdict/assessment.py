@@ -55,8 +55,8 @@ class Ceilings:
     Attributes
     ----------
     coherence_db : float or None
-        What the coherence of reference and disturbance allows; None if the disturbance was computed from the reference,
-        without sensor noise.
+        What the coherence of reference and disturbance allows; None with feedback, or if the disturbance was computed
+        from the reference without sensor noise.
     time_db : float
         A filter that may look ahead, with any power.
     filter_db : float
@@ -251,12 +251,12 @@ class Assessment:
         cause = self.limited_by
         if cause is None:
             return ""
-        if cause == "amplifier" and self.ceilings.power_db >= self.want_db:
+        if self.limited_by_run:
             cause = "peaks" if self.limited_by_peaks else "windows"
         ceilings = {name: "" if value is None else _db(value) for name, value in vars(self.ceilings).items()}
         text = _REASONS[cause]
         if cause == "windows" and self.unclipped_db is not None:
-            text += " Without clipping it would reach {unclipped}."
+            text += " Without clipping the run would reach {unclipped}."
         return text.format(
             **ceilings,
             reached=_db(self.noise_reduction_db),
@@ -269,16 +269,25 @@ class Assessment:
         )
 
     @property
+    def limited_by_run(self) -> bool:
+        """Whether the amplifier limits by what only the run meets: clipping, or short windows."""
+        return self.limited_by == "amplifier" and self.ceilings.power_db >= self.want_db
+
+    @property
     def limited_by_peaks(self) -> bool:
         """Whether the run would reach the noise reduction wanted with the same rated power if nothing clipped."""
         return self.unclipped_db is not None and self.unclipped_db >= self.want_db
 
     @property
     def peak(self) -> str:
-        """Largest magnitude of the control signal in words: in V if its scale is known."""
+        """Largest magnitude of each control signal that has a limit, in words: in V if its scale is known."""
         volts = self.volts_per_unit
-        peaks = np.array(self.limits.amplitude_limit, dtype=float) * (1.0 if volts is None else volts)  # NaN of None
-        return _each(peaks, ".3g", "" if volts is None else " V")
+        peaks = np.ravel(np.array(self.limits.amplitude_limit, dtype=float) * (1.0 if volts is None else volts))
+        unit = "" if volts is None else " V"
+        if np.ptp(peaks) == 0.0:
+            return _each(peaks, ".3g", unit, " at each loudspeaker")
+        limited = ((j, peak) for j, peak in enumerate(peaks, 1) if not np.isnan(peak))  # NaN of None
+        return " and ".join(f"{_each(peak, '.3g', unit)} at loudspeaker {j}" for j, peak in limited)
 
     @property
     def stability(self) -> str:
@@ -360,10 +369,7 @@ class Assessment:
 
 def _each(values: Any, form: str, unit: str = "", all_the_same: str = " each") -> str:
     """Return a number, or those of several loudspeakers, as text: "20 W", "20 W each" or "20 and 10 W"."""
-    texts = [
-        "none" if np.isnan(value) else format(float(format(value, form)), "g")  # 1250, not 1.25e+03
-        for value in np.ravel(values)
-    ]
+    texts = [format(float(format(value, form)), "g") for value in np.ravel(values)]  # 1250, not 1.25e+03
     if len(set(texts)) == 1:
         return f"{texts[0]}{unit}{all_the_same if len(texts) > 1 else ''}"
     return f"{', '.join(texts[:-1])} and {texts[-1]}{unit}"
@@ -393,7 +399,7 @@ _REASONS = {
     "filter": "The filter limits: {taps} taps reach {filter_db} with any power, and more time does not help.",
     "amplifier": "The amplifier limits: with any power {filter_db} are in reach, with {rated} {power_db} for a fixed filter.",
     "peaks": "The amplifier's peak voltage limits: what is above {peak} is clipped, although the run takes only {share} of "
-    "the rated power. Without clipping it would reach {unclipped} with {rated}.",
+    "the rated power. Without clipping the run would reach {unclipped} with {rated}.",
     "windows": "The amplifier limits: with {rated} a fixed filter reaches {power_db}, but the run, which keeps the rated power "
     "in each window of {window:g} s, only {reached}.",
     "adaptation": "The adaptation limits: a fixed filter reaches {power_db} within the rated power, the controller {reached}, "

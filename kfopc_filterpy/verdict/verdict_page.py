@@ -191,9 +191,7 @@ def _tables(verdict: Assessment) -> Any:
     """Yield the tables: what limits, the algorithms, the bands."""
     taps = verdict.settings.n_taps
     rows: list[list[str | float]] = []
-    limit = verdict.limited_by
-    if limit == "amplifier" and verdict.ceilings.power_db >= verdict.want_db:
-        limit = "adaptation"  # clipping, or short windows: what only the run meets
+    limit = "adaptation" if verdict.limited_by_run else verdict.limited_by
     for name, what, cause in CHAIN:
         value = getattr(verdict.ceilings, name)
         mark = "limits" if cause == limit else ""

@@ -22,6 +22,7 @@ from kfopc_filterpy.signals import Recording, band_limited_noise
 from kfopc_filterpy.verdict import assess
 from kfopc_filterpy.verdict.assessment import CAUSES, SCHEMA, advice_on
 from kfopc_filterpy.verdict.candidates import STEP_SIZES
+from kfopc_filterpy.verdict.limits import Limits
 from kfopc_filterpy.verdict.verdict_page import _bound, _tables
 
 FS, SECONDS, TAPS = 8000, 3.0, 32
@@ -106,6 +107,9 @@ def test_the_sensor_noise_of_the_plant_limits_unless_the_disturbance_was_recorde
     for reached in (verdict.ceilings.filter_db, verdict.noise_reduction_db):
         assert reached == pytest.approx(10 * np.log10(2), abs=0.5)  # 32 weights fit some of it by chance
     assert any("the coherence shows only the plant's sensor noise" in note for note in verdict.notes)
+    by_ear = assess(noise(), noisy, feedback=True, **options)
+    assert by_ear.ceilings.coherence_db is None
+    assert any("so the coherence is not checked" in note for note in by_ear.notes)
     recorded = [assess(noise(), plant, disturbance=heard(arriving(20), 15.0), **options) for plant in (PLANT, noisy)]
     assert recorded[0].noise_reduction_db == recorded[1].noise_reduction_db > 10.0
 
@@ -118,7 +122,7 @@ def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing(tmp_path):
     share = 100 * small.figures["KF-PB"]["of_rated_power"]
     assert small.reason == (
         f"The amplifier's peak voltage limits: what is above 4.9 V is clipped, although the run takes only {share:.2g} % of "
-        f"the rated power. Without clipping it would reach {small.unclipped_db:.1f} dB with 1.5 W into 8 ohm."
+        f"the rated power. Without clipping the run would reach {small.unclipped_db:.1f} dB with 1.5 W into 8 ohm."
     )
     noise = "If the data sheet states watts of noise, give noise_watt; if "
     assert small.advice[1] == f"{noise}the amplifier clips at a higher voltage, give peak_volts."
@@ -146,7 +150,23 @@ def test_the_cause_is_the_amplifier_if_only_a_filter_that_is_fixed_does_with_its
     )
     assert [row[2] for row in next(_tables(verdict)).rows] == ["", "", "", "", "limits", ""]
     clipped = replace(verdict, unclipped_db=11.7)  # which is not enough, either
-    assert clipped.reason == f"{verdict.reason} Without clipping it would reach 11.7 dB."
+    assert clipped.reason == f"{verdict.reason} Without clipping the run would reach 11.7 dB."
+
+
+@pytest.mark.parametrize(
+    ("peaks", "volts", "told"),
+    [
+        ((8.0,), None, "8"),
+        ((4.9, 4.9), 2.0, "9.8 V at each loudspeaker"),
+        ((8.0, 6.0), 1.0, "8 V at loudspeaker 1 and 6 V at loudspeaker 2"),
+        ((None, 8.0), None, "8 at loudspeaker 2"),
+    ],
+)
+def test_a_peak_is_told_of_each_loudspeaker_that_has_a_limit(peaks, volts, told):
+    verdict = verdict_on("amplifier", better=True)
+    limits = Limits(tuple(replace(verdict.limits.each[0], amplitude_limit=peak) for peak in peaks), len(peaks) > 1)
+    scale = volts if volts is None else np.full(len(peaks), volts)
+    assert replace(verdict, limits=limits, volts_per_unit=scale).peak == told
 
 
 @pytest.mark.parametrize(
