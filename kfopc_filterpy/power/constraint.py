@@ -136,7 +136,7 @@ class OutputPowerConstraint:
         factor = None if value is None else as_nonnegative(value, "constraint_factor")
         if factor is not None and factor > 1.0:
             raise ValueError(
-                f"constraint_factor must be 1 at most (eq. 13), got {factor:g}: 1 leaves the measurement as it is"
+                f"constraint_factor must be 1 at most (eq. 13), got {factor!r}: 1 leaves the measurement as it is"
             )
         self._supply("factor", factor)
 

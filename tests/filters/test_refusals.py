@@ -132,6 +132,7 @@ OTHER_STEPS = {
     "f.alpha = 0.5": "alpha",
     "f.constraint_factor = -0.5": "constraint_factor (must not be negative|needs a constraint)",
     "f.constraint_factor = 1.5": "constraint_factor (must be 1 at most .*got 1.5|needs a constraint)",
+    "f.constraint_factor = 1 + 1e-10": r"constraint_factor (must be 1 at most .*got 1\.0000000001:|needs a constraint)",
     "f.rated_power = -1.0": "rated_power must be greater than 0",
     "f.rated_power = [1.0, 2.0]": "rated_power must be a single number",
     'f.constraint = "tight"': "constraint must be an OutputPowerConstraint or None, got 'tight'; kf_opc takes several",
