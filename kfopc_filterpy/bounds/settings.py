@@ -95,7 +95,7 @@ def suggest_settings(
         Plant with the estimated secondary path. Its sensor noise counts, too: it is part of q.
     disturbance : array_like, shape (n_samples,) or (K, n_samples), optional
         Signal of the error microphone, the disturbance d, in place of the plant's primary path. Leave out its start-up
-        transient. It has the microphone's noise in it.
+        transient. It contains the microphone's noise.
     memory_s : float, default 0.25
         Memory of the filter in seconds. A longer one leaves less error, a shorter one follows changes of the noise and
         of the paths faster.
@@ -303,7 +303,7 @@ def _why_length(errors: np.ndarray, taps: int, d_power: float, n_taps: int | Non
 
 def _why_noise(error_power: float, taps: int, d_power: float, record_s: float, sensor_noise: float) -> str:
     if max(error_power, ERROR_THAT_MATTERS * d_power) < sensor_noise:
-        return f"the power of the plant's sensor noise, which is more than the {error_power:.3g} that the record tells"
+        return f"the power of the plant's sensor noise, which is more than the {error_power:.3g} found in the record"
     if error_power < ERROR_THAT_MATTERS * d_power:
         level = -10 * np.log10(ERROR_THAT_MATTERS)
         return f"{level:.0f} dB below the disturbance's power of {d_power:.3g}: a microphone is hardly ever quieter"

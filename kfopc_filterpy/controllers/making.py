@@ -14,7 +14,7 @@ _Maker = TypeVar("_Maker", bound=Callable[..., Any])
 def controller_maker(make: _Maker) -> _Maker:
     """Return a function that makes a controller, and says what is wrong with arguments that its law does not take.
 
-    Those are a rated power or a rate, without a use for it, and its first two in the other order.
+    That is: a rated power or rate that it has no use for, or its first two arguments swapped.
     """
     known = signature(make).parameters
 

@@ -96,7 +96,7 @@ def mov_fx_lms(
     n_taps, secondary, n_references
         As for `fx_lms`.
     step_size : float
-        Step size mu, above zero. Start where `fx_lms` starts, times the constraint factor that the penalty stands for.
+        Step size mu, above zero. Start where `fx_lms` starts, times the constraint factor to be expected.
     rated_power : float or array_like, shape (J,), optional
         Rated output power rho_o, or that of each loudspeaker.
     constraint : OutputPowerConstraint or sequence of J of them, optional

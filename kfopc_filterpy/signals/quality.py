@@ -13,7 +13,7 @@ STEPS = 2.0  # smallest steps of the numbers: what clips comes from further away
 
 
 def recording_remarks(samples: ArrayLike, fs: float, name: str) -> list[str]:
-    """Return remarks on a recording, (n_samples,) or (n_channels, n_samples): that it is short, clipped, or twice the same."""
+    """Return remarks on a recording, (n_samples,) or (n_channels, n_samples): that it is short or clipped, or has equal channels."""
     channels = np.atleast_2d(samples)
     remarks = clipping_remarks(channels, name)
     seconds = channels.shape[-1] / fs
