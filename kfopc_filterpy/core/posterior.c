@@ -502,6 +502,18 @@ static judgement judge(posterior *f)
     return found;
 }
 
+/* Return the rms error over the secondary paths that is left, by the draws. */
+static real doubt_of_paths(const posterior *f)
+{
+    real sum = 0, *path = f->right;
+    for (int32_t row = f->K; row < f->rows; row++)
+        for (int32_t c = f->I; c < f->C; c++) {
+            path_of(f, row, c, path);
+            sum += dot(path, path, f->M);
+        }
+    return root(sum / ((real)(f->K * f->J) * size_of_path(f)));
+}
+
 /* Return whether a block is to be believed. Forget all if it tells of another plant. */
 static int notice_surprise(posterior *f, const judgement *is, real forget)
 {
@@ -526,8 +538,11 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     f->counts[WAITING] = 1;
     /* If the control does no good, listen to p alone. */
     f->counts[SILENT] = is->heard / (real)f->B >= is->expected / count;
-    /* If it does good, s is as before, unless that was wrong at the last surprise. */
-    known->spread = f->counts[SILENT] || known->spread <= HELD ? REDRAWN : HELD;
+    /* If it does good, s is as it was learned, unless that was wrong at the last surprise. */
+    if (f->counts[SILENT] || known->spread <= HELD)
+        known->spread = REDRAWN;
+    else if (2 * doubt_of_paths(f) < known->spread)
+        known->spread = HELD;
     expect_learned(f);
     begin_data(f, 0);
     return 0;

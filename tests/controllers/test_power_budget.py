@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, lfilter
 
 from kfopc_filterpy import Plant, kf_pb, noise_reduction_db, output_power, power_constrained_wiener, simulate
-from kfopc_filterpy.paths import PathTolerance, fir_path, misalignment_db
+from kfopc_filterpy.paths import PathTolerance, fir_path, misalignment_db, path_taps, perturbed_path
 from kfopc_filterpy.paths.uncertainty import rms_relative_error
 from kfopc_filterpy.signals import band_limited_noise
 
@@ -160,6 +160,19 @@ def test_silence_after_a_surprise_teaches_nothing() -> None:
     for reference in np.r_[np.zeros(3 * BLOCK), x[:BLOCK]]:
         assert controller.control_signal(reference) == 0.0
         controller.update(0.0)
+
+
+@pytest.mark.parametrize("delay", [-0.75, 0.75])
+def test_a_path_that_is_not_learned_yet_is_not_held_at_a_surprise(delay: float) -> None:
+    """An estimate so wrong that the first blocks surprise: it was held for good, and cost 2 to 4 of 5.8 dB."""
+    secondary, fs = np.array([0.0, 0.0, 0.0, 1.0, -0.6]), 8000.0
+    plant = Plant(secondary, 0.8 * np.eye(10)[8] + 0.4 * np.eye(10)[9], fs=fs)
+    x = np.random.default_rng(1).standard_normal(round(3 * fs))
+    wrong = path_taps(perturbed_path(secondary, fs=fs, delay_samples=delay))
+    told, exact = (kf_pb(24, path, rated_power=0.3, fs=fs) for path in (wrong, secondary))
+    runs = simulate([told, exact], x, plant)
+    assert told.alarms == 1
+    assert abs(runs[0].noise_reduction_db - runs[1].noise_reduction_db) < 0.1
 
 
 def test_a_later_secondary_path_is_learnt_when_a_second_surprise_contradicts_that_it_is_the_same() -> None:

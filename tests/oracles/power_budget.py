@@ -198,7 +198,12 @@ class Plant:
         if surprised:
             self.waiting, self.surprises = True, self.surprises + 1
             self.silent = heard >= d2  # the control does no good: listen to p alone
-            self.spread = core.REDRAWN if self.silent or self.spread <= core.HELD else core.HELD
+            s = self.paths()[1][self.K :]
+            doubt = math.sqrt(np.sum(s**2) / np.sum(self.s_hat**2))
+            if self.silent or self.spread <= core.HELD:
+                self.spread = core.REDRAWN
+            elif 2 * doubt < self.spread:
+                self.spread = core.HELD  # s has been learned, and is as it was
             self.mean[:, self.split :] = self.theta[: self.K, self.split :]
             self.begin(z, 0)
         return not surprised
