@@ -75,7 +75,7 @@ def fx_lms(
     Trans. ASSP 28(4), 1980. S. J. Elliott, I. M. Stothers, P. A. Nelson, "A multiple error LMS algorithm and its
     application to the active control of sound and vibration", IEEE Trans. ASSP 35(10), 1987. S. J. Elliott, "Signal
     processing for active control", 2001, chapter 3, and P. Kabal, "The stability of adaptive minimum mean square error
-    equalizers using delayed adjustment", IEEE Trans. Commun. 31(3), 1983, for the step size.
+    equalizers using delayed adjustment", IEEE Trans. Communications 31(3), 1983, for the step size.
 
     Examples
     --------
