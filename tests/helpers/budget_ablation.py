@@ -1,8 +1,8 @@
 """Print what breaks without each constant of KF-PB: ``python tests/helpers/budget_ablation.py [constant ...]``.
 
 In a copy of the package, a constant of the C core gets a value that takes it out of effect, or makes it small. Then
-KF-PB runs through the events and ten noises of its studies, with three loudspeakers, and with an amplifier that clips
-peaks.
+KF-PB runs through the events and ten noises of its studies, with three loudspeakers, with two for one microphone, and
+with an amplifier that clips peaks.
 """
 
 from __future__ import annotations
@@ -30,9 +30,17 @@ if __name__ == "__main__" and "PYTHONPATH" not in os.environ:
 from comparisons.studies import events  # noqa: E402
 from comparisons.studies import kf_pb_cases as study  # noqa: E402
 from comparisons.studies.cases import FS  # noqa: E402
-from kfopc_filterpy import HardClipAmplifier, Plant, kf_pb, noise_reduction_db, simulate  # noqa: E402
+from kfopc_filterpy import (  # noqa: E402
+    HardClipAmplifier,
+    Plant,
+    kf_pb,
+    noise_reduction_db,
+    power_constrained_wiener,
+    simulate,
+)
 from kfopc_filterpy.core.library import load  # noqa: E402
 from kfopc_filterpy.metrics import overshoot  # noqa: E402
+from kfopc_filterpy.signals import band_limited_noise  # noqa: E402
 
 WITHOUT = {  # the value that takes a constant out of effect, or makes it as small as is sensible
     "PLANNED": "1",
@@ -84,6 +92,21 @@ def three_loudspeakers() -> tuple[float, float]:
     return noise_reduction_db(run.error[:, fs:], d[:, fs:], steady=1.0), float(np.max(power))
 
 
+def two_loudspeakers_for_one_microphone() -> tuple[float, float]:
+    """Return the same with a rated power that is nearly enough for full control, which they can share in many ways."""
+    rng, fs, n = np.random.default_rng(7), 8000.0, 48000
+    s = rng.standard_normal((1, 2, 24)) * 0.85 ** np.arange(24) * (np.arange(24) >= 2)
+    p = np.roll(rng.standard_normal(60) * 0.85 ** np.arange(60), 16) * (np.arange(60) >= 16)
+    x = band_limited_noise((80, 2000), n / fs, fs=fs, rng=3)
+    d = np.convolve(x, p)[:n] + 0.01 * rng.standard_normal(n)
+    plant = Plant(s, fs=fs)
+    full = power_constrained_wiener(x, plant, n_taps=48, disturbance=d, rated_power=1e6).whole.control_power
+    rated = 0.6 * np.asarray(full)
+    run = simulate(kf_pb(48, s, rated_power=rated, fs=fs), x, plant, disturbance=d)
+    power = np.mean(run.control_signal[:, n // 3 :] ** 2, axis=1) / rated
+    return noise_reduction_db(run.error[:, n // 3 :], d[np.newaxis, n // 3 :], steady=1.0), float(np.max(power))
+
+
 def clipped_peaks() -> tuple[float, float, int]:
     """Return noise reduction, power and alarms with just enough power, and an amplifier that clips the highest peaks."""
     own = events.event("start, ample power")
@@ -106,6 +129,7 @@ def measure(made: Path) -> dict[str, Any]:
         power = overshoot(run.control_signal, case.rated_power, FS, window_s=10.0)
         of_cases[name] = case.reduction_db(run.error), power, int(controller.alarms)
     of_cases["three loudspeakers"] = *three_loudspeakers(), 0
+    of_cases["two loudspeakers, one microphone"] = *two_loudspeakers_for_one_microphone(), 0
     of_cases["clipped peaks"] = clipped_peaks()
     return {"events": of_events, "cases": of_cases}
 
