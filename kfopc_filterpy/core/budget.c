@@ -36,11 +36,12 @@ enum { SHORTER = 5 };
 static const real GROWTH = 10;
 /* Steps of conjugate gradients towards filters. */
 enum { FILTER_STEPS = 12 };
-/* Share of a path's gain that short filters leak into directions in which its spectra have none.
- * With less, filters follow a price slowly there; with more, prices swing. */
+/* Share of the paths' gains that is added to the prices. Short filters leak about as much into
+ * directions in which their spectra have none: with less, filters follow a price slowly there, and
+ * play what hardly reduces the error; with more, prices swing. */
 static const real LEAKED = (real)1e-4;
-/* No filter has a larger tap. REGULAR: share of the powers of x that is added to them, and of the
- * paths' gains that is added to the prices, so that rounding leaves the matrix definite. */
+/* No filter has a larger tap. REGULAR: share of the powers of x that is added to them, so that
+ * rounding leaves the matrix definite. */
 #ifdef ANC_FLOAT
 static const real LARGEST_TAP = 1e6f, REGULAR = 1e-5f, LEAST_POWER = 1e-30f;
 #else
@@ -288,7 +289,7 @@ static void multiply_filters(void *self, real *to, const real *v)
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++) {
             const real *own = f->products + times(j * I + i, F->F);
-            const real price = f->price[j] + REGULAR * f->gain[j];
+            const real price = f->price[j] + LEAKED * f->gain[j];
             for (int32_t k = 0; k < F->F; k++) sums[k] = price * own[k];
             for (int32_t a = 0; a < J; a++)
                 add_product(F, sums, f->SS + times(j * J + a, F->F),

@@ -425,9 +425,9 @@ class PowerBudget(Controller):
 
     def solved(self, price, v):
         """Return filters after some steps from v towards those at the prices."""
-        priced, leaking = (np.diag(price + share * self.gain)[..., None] for share in (core.REGULAR, core.LEAKED))
+        priced = np.diag(price + core.LEAKED * self.gain)[..., None]
         lags, L = self.A_lags + np.kron(priced, self.R_lags), self.w.shape[2]
-        near = np.einsum("jaf,icf->jiacf", self.SS + leaking, spectra(self.R_lags, L)[0])
+        near = np.einsum("jaf,icf->jiacf", self.SS + priced, spectra(self.R_lags, L)[0])
         self.W = preconditioner(near.reshape(lags.shape), self.turn, L)
         return conjugate_gradients(toeplitz(lags, L), self.W, self.b, v.ravel(), core.FILTER_STEPS).reshape(v.shape)
 
