@@ -275,6 +275,9 @@ static void set_equations(budget *f)
     }
 }
 
+/* Return the price in the equations. */
+static real price_of(const budget *f, int32_t j) { return f->price[j] + LEAKED * f->gain[j]; }
+
 /* Set to = (A + price R) v for all filters. */
 static void multiply_filters(void *self, real *to, const real *v)
 {
@@ -289,7 +292,7 @@ static void multiply_filters(void *self, real *to, const real *v)
     for (int32_t j = 0; j < J; j++)
         for (int32_t i = 0; i < I; i++) {
             const real *own = f->products + times(j * I + i, F->F);
-            const real price = f->price[j] + LEAKED * f->gain[j];
+            const real price = price_of(f, j);
             for (int32_t k = 0; k < F->F; k++) sums[k] = price * own[k];
             for (int32_t a = 0; a < J; a++)
                 add_product(F, sums, f->SS + times(j * J + a, F->F),
@@ -304,10 +307,8 @@ static void precondition_filters(void *self, real *to, const real *r)
     solve_circulants(&f->posterior.fourier, f->factor, f->spectra, to, r, f->s.J * f->s.I, f->s.L);
 }
 
-/* Factorise (SS + price + leak) R at each frequency, with a smooth R. With more loudspeakers than
- * microphones, SS leaves directions of v open, as A nearly does: the price and the leak decide
- * there.
- */
+/* Factorise (SS + price) R at each frequency, with a smooth R. With more loudspeakers than
+ * microphones, SS leaves directions of v open, as A nearly does: the price decides there. */
 static void factorise_filters(budget *f)
 {
     const int32_t I = f->s.I, J = f->s.J;
@@ -318,7 +319,7 @@ static void factorise_filters(budget *f)
             const real *R = f->smooth_R + times(i * I + c, F->F);
             real *at = f->factor + times(ji * J * I + ac, F->F);
             multiply_rows(F, at, f->SS + times(j * J + a, F->F), R, 1, 1);
-            if (j == a) add_scaled(at, f->price[j] + LEAKED * f->gain[j], R, F->F);
+            if (j == a) add_scaled(at, price_of(f, j), R, F->F);
         }
     factorise_spectra(F, f->factor, J * I);
 }

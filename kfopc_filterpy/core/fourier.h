@@ -32,9 +32,7 @@ void transform_rows_back(const fourier *f, real *rows, const real *spectra, int3
                          int32_t taps);
 /* Add sum_k u(k) v(k + l), k < n, to to_l, l < lags; v has n + lags - 1 numbers. */
 void add_lags(const fourier *f, real *to, const real *u, int32_t n, const real *v, int32_t lags);
-/* The same for each row of u with each other and itself, C rows of this length; `to` is (C, C,
- * lags).
- */
+/* The same for each of C rows of u with each, and itself; `to` is (C, C, lags). */
 void add_all_lags(const fourier *f, real *to, const real *u, int32_t C, int32_t row, int32_t n,
                   int32_t lags);
 /* Set a spectrum to that of ahead_l at lags l and behind_l at lags -l, l < n, under a triangle that

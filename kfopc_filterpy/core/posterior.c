@@ -134,13 +134,21 @@ static real precision_of(const posterior *f, int32_t c)
     return c < f->I ? f->numbers->precision : f->numbers->precision_s;
 }
 
+/* Return the energy in the data of the signals from `begin` to `end`. */
+static real energy_of_data(const posterior *f, int32_t begin, int32_t end)
+{
+    real energy = 0;
+    for (int32_t c = begin; c < end; c++) energy += f->T[times(c * f->C + c, f->N)];
+    return energy;
+}
+
 /* Set the precisions: of the primary paths from |p|^2 = E[d^2 + e^2] / E[x^2] of the data of now.
  * Guess the first noise: -30 dB, which counts as n samples. Return 0 if nothing can be told yet. */
 static int set_precisions(posterior *f)
 {
     posterior_numbers *known = f->numbers;
-    real x2 = 0, e2 = 0, q = 0;
-    for (int32_t i = 0; i < f->I; i++) x2 += f->T[times(i * f->C + i, f->N)];
+    const real x2 = energy_of_data(f, 0, f->I);
+    real e2 = 0, q = 0;
     for (int32_t k = 0; k < f->K; k++) {
         e2 += f->ee[k];
         q += f->q[k];
@@ -281,14 +289,6 @@ void path_of(const posterior *f, int32_t row, int32_t signal, real *to)
     const real share = signal < f->I ? f->numbers->significant * drawn : drawn;
     const real *t = taps_of(f, f->solution, row, signal);
     for (int32_t i = 0; i < taps_in(f, signal); i++) to[i] = share * f->taper[i] * t[i];
-}
-
-/* Return the energy in the data of the signals from `begin` to `end`. */
-static real energy_of_data(const posterior *f, int32_t begin, int32_t end)
-{
-    real energy = 0;
-    for (int32_t c = begin; c < end; c++) energy += f->T[times(c * f->C + c, f->N)];
-    return energy;
 }
 
 /* Approach the solution of a row. */
