@@ -101,7 +101,7 @@ def two_loudspeakers_for_one_microphone() -> tuple[float, float]:
     d = np.convolve(x, p)[:n] + 0.01 * rng.standard_normal(n)
     plant = Plant(s, fs=fs)
     full = power_constrained_wiener(x, plant, n_taps=48, disturbance=d, rated_power=1e6).whole.control_power
-    rated = 0.6 * np.asarray(full)
+    rated = 0.9 * np.asarray(full)
     run = simulate(kf_pb(48, s, rated_power=rated, fs=fs), x, plant, disturbance=d)
     power = np.mean(run.control_signal[:, n // 3 :] ** 2, axis=1) / rated
     return noise_reduction_db(run.error[:, n // 3 :], d[np.newaxis, n // 3 :], steady=1.0), float(np.max(power))
