@@ -228,6 +228,12 @@ class Plant:
             reason = f": by then the last change of {' or '.join(sorted(changed))} has ended" if same else ""
             raise ValueError(f"time_s must be {free / self.fs:g} s at least, got {at:g} s{reason}")
         now = self._changes[-1].plant if self._changes else self
+        for name in changed & set(PATHS):
+            old, taps = getattr(now, name), READERS[name](given[name], fs=self.fs, n_taps=self._n_path, name=name)[0]
+            if old is not None and old.shape[:2] != taps.shape[:2]:
+                raise ValueError(
+                    f"{name} must keep its channels when it changes, {old.shape[:2]}, got taps {taps.shape}"
+                )
         then = Plant(
             now.secondary if secondary is None else secondary,
             now.primary if primary is None else primary,
@@ -237,12 +243,6 @@ class Plant:
             n_path=self._n_path,
             sensor_noise_std=self.sensor_noise_std,
         )
-        for name in PATHS:
-            old, new = getattr(now, name), getattr(then, name)
-            if new is not None and old is not None and old.shape[:2] != new.shape[:2]:
-                raise ValueError(
-                    f"{name} must keep its channels when it changes, {old.shape[:2]}, got taps {new.shape}"
-                )
         if now.primary is None and primary is not None:
             raise ValueError("primary cannot appear during a run: make the plant with a primary path")
         other = copy(self)

@@ -133,6 +133,12 @@ class PowerConstrainedWiener:
     disturbance: np.ndarray = field(repr=False)
     fs: float
 
+    def __repr__(self) -> str:
+        seconds = self.disturbance.shape[-1] / self.fs
+        reached = f"noise reduction {self.per_second.noise_reduction_db:.1f} dB within the rated power"
+        free = f"{self.unconstrained.noise_reduction_db:.1f} dB without it"
+        return f"<PowerConstrainedWiener: {seconds:g} s at {self.fs:g} Hz, {reached}, {free}>"
+
     def noise_reduction_over(self, start_s: float = 0.0, end_s: float | None = None) -> dict[str, float]:
         """Return the noise reduction of each solution over a part of the record, -10 log10(sum e^2 / sum d^2) in dB.
 

@@ -52,7 +52,7 @@ class CoreController(Channels, BlockProcessing, Checkpointed):
         Settings of the algorithm: a number each, or also (J,) or (K,) where each loudspeaker or microphone has its own.
     n_references : int, default 1
         Number of references I; None: the algorithm takes one channel only.
-    amplifier : callable or sequence of J of them, optional
+    amplifier : amplifier model or sequence of J of them, optional
         Known amplifier: the disturbance is then estimated with s^ * amplifier(y), not s^ * y.
     rated_power : float or array_like, shape (J,), optional
         Rated power of a constraint with default settings.

@@ -31,7 +31,7 @@ class FeedbackNeutralizer(WrappedController):
     feedback : array_like, shape (taps,) or (I, J, taps), control system, Recording, or Plant with a feedback path
         Identified path from the loudspeaker to the reference microphone, or those from J loudspeakers to I reference
         microphones, see `paths.estimate_path`. Its first tap must be 0: sound takes time.
-    amplifier : callable or sequence of J of them, optional
+    amplifier : amplifier model or sequence of J of them, optional
         Known amplifiers: the feedback is then computed from what they deliver, not from y.
 
     Raises

@@ -84,7 +84,7 @@ def kf_anc(
         the three from a silent run.
     n_references : int, default 1
         Number of references I.
-    amplifier : callable or sequence of J of them, optional
+    amplifier : amplifier model or sequence of J of them, optional
         Known amplifier model: the disturbance is then estimated with s^ * amplifier(y), not s^ * y as published.
     limiter : OutputLimiter or sequence of J of them, optional
         Limiter of the control signal, or one for each loudspeaker, not shared with another controller.

@@ -163,7 +163,7 @@ def kf_pb(
         Rated output power of all loudspeakers or of each, the mean square of the control signal.
     n_references : int, default 1
         Number of references I.
-    amplifier : callable or sequence of J of them, optional
+    amplifier : amplifier model or sequence of J of them, optional
         Known amplifier model: the loudspeakers then play amplifier(y), not y.
     limiter : OutputLimiter or sequence of J of them, optional
         Limiter of the control signal, not shared with another controller.

@@ -103,7 +103,7 @@ def mov_fx_lms(
         Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
     fs : float, optional
         Sample rate in Hz of the power estimates; a system, a recording or a plant as `secondary` brings it.
-    amplifier : callable or sequence of J of them, optional
+    amplifier : amplifier model or sequence of J of them, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
         As for `fx_lms`.

@@ -227,7 +227,7 @@ class VirtualMicrophones(WrappedController):
         Indices of the microphones that exist, in the order in which the observer takes them.
     virtual : sequence of int, optional
         Indices of the virtual microphones, in the order in which the observer returns them; by default all others.
-    amplifier : callable or sequence of J of them, optional
+    amplifier : amplifier model or sequence of J of them, optional
         Known amplifiers: the disturbance is then estimated from what they deliver, not from y.
 
     Attributes

@@ -30,7 +30,7 @@ def reasons(real: str = "double") -> tuple[str, ...]:
     loudest, reference, learnt, step = (f"1e{math.log10(constant(name, real)):.0f}" for name in names)
     return (
         "",
-        f"the reference is too loud, above {reference} over the gain of the secondary path: scale the signals",
+        f"the reference is too loud, above {reference} divided by the gain of the secondary path: scale the signals",
         f"the error is too loud, above {loudest}: scale the signals",
         f"the disturbance estimate e + s^ * y is too loud, above {loudest}, or {learnt} with an internal model: scale the "
         "signals",

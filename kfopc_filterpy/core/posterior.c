@@ -523,9 +523,14 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     const real grown =
         known->expected > 0 ? known->missed / known->expected * is->expected / each : 0;
     const real noise = larger(mean_noise(f), grown);
+    const int on_trial = f->counts[ON_TRIAL];
+    f->counts[ON_TRIAL] = 0;
     int surprised = is->missed > SURPRISE * noise * each;
     if (surprised) {
-        const real limit = SURPRISE * (noise + power_of_doubt(f));
+        real doubt = power_of_doubt(f);
+        /* A block that is shorter than p leaves so much doubt that no wrong hold would surprise. */
+        if (on_trial) doubt = smaller(doubt, is->expected / (SURPRISE * SURPRISE * each));
+        const real limit = SURPRISE * (noise + doubt);
         surprised = is->missed > limit * each;
         if (surprised && is->missed_at_last <= limit * count_of(f, last_part(f)) * (real)f->K)
             return 0;
@@ -538,12 +543,15 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     f->counts[WAITING] = 1;
     /* If the control does no good, listen to p alone. */
     f->counts[SILENT] = is->heard / (real)f->B >= is->expected / count;
+    const int learned = !f->exact && 2 * doubt_of_paths(f) < known->spread;
+    if (learned) expect_learned(f);
     /* If it does good, s is as it was learned, unless that was wrong at the last surprise. */
     if (f->counts[SILENT] || known->spread <= HELD)
         known->spread = REDRAWN;
-    else if (2 * doubt_of_paths(f) < known->spread)
+    else if (learned) {
         known->spread = HELD;
-    expect_learned(f);
+        f->counts[ON_TRIAL] = 1;
+    }
     begin_data(f, 0);
     return 0;
 }

@@ -471,7 +471,10 @@ class KFOPC(KalmanFilter, Checkpointed):
     def _require_other_row(self, H: Any) -> None:
         """Raise an error if H does not change."""
         if self._equal_rows >= EQUAL_ROWS and np.any(H) and np.array_equal(H, self._row):
-            raise ValueError(f"with a rated power, H must change, but was the same in {EQUAL_ROWS} steps: {TRACKER}")
+            raise ValueError(
+                f"with a rated power, H must change, but was the same in {EQUAL_ROWS} steps. Is the reference sensor "
+                f"connected? Otherwise: {TRACKER}"
+            )
 
     def _note_row(self, H: Any) -> None:
         """Count the steps with the same H, until there is another."""

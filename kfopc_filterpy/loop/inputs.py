@@ -52,7 +52,7 @@ def switch_on_sample(switch_on_s: float, fs: float, n_samples: int) -> int:
     """Return the number of samples before the control is switched on."""
     on = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
     if on >= n_samples:
-        raise ValueError("switch_on_s must leave samples to control: it covers the whole signal")
+        raise ValueError(f"switch_on_s must be less than the signal's {n_samples / fs:g} s, got {switch_on_s:g} s")
     return on
 
 

@@ -158,8 +158,9 @@ def amplifier_models(amplifier: Amplifier | Sequence[Amplifier | None] | None, n
     """Return kind, limit and sharpness of the amplifier models of all loudspeakers, (J, 3)."""
     models = [compiled_model(one) for one in _each(amplifier, n_loudspeakers)]
     if len(models) != n_loudspeakers or any(model is None for model in models):
+        for_each = f", or one for each of the {n_loudspeakers} loudspeakers" if n_loudspeakers > 1 else ""
         raise TypeError(
-            "amplifier must be None, one of kfopc_filterpy's amplifier models, or one for each of the "
-            f"{n_loudspeakers} loudspeakers, got {amplifier!r}"
+            "amplifier must be None or one of kfopc_filterpy's amplifier models, such as HardClipAmplifier"
+            f"{for_each}, got {amplifier!r}"
         )
     return np.array(models).view(np.float64).reshape(n_loudspeakers, -1)

@@ -126,6 +126,13 @@ def test_a_path_that_flips_its_polarity() -> None:
     assert oracle.plant.surprises
 
 
+def test_a_block_that_is_shorter_than_the_paths_after_a_surprise() -> None:
+    s, x, d, _ = scene(1, 1, 1, 1, 5.0, M=60)
+    oracle, controller = pair(s, 90, 1, np.array([0.25 * np.mean(d**2)]), 0.3)
+    compare(oracle, controller, x, d, lambda n: s if n < 4.0 * FS else np.roll(s, 1))
+    assert oracle.plant.surprises > 1
+
+
 @pytest.mark.parametrize("spread", [0.0, 0.3])
 def test_a_primary_path_that_flips_its_polarity(spread: float) -> None:
     s, x, d, _ = scene(2, 1, 1, 1, 12.0)

@@ -184,6 +184,56 @@ def test_a_later_secondary_path_is_learnt_when_a_second_surprise_contradicts_tha
     assert misalignment_db(controller.identified_path, later) < -10.0
 
 
+def resonance(hz: float, delay: int, damping: float, gain: float) -> np.ndarray:
+    """A path of 200 taps after its delay, with the largest gain at its frequency."""
+    t = np.arange(200) / FS
+    w = 2 * np.pi * hz
+    h = np.exp(-damping * w * t) * np.sin(w * np.sqrt(1 - damping**2) * t)
+    return np.concatenate([np.zeros(delay), gain * h / np.max(np.abs(np.fft.rfft(h, 4096)))])
+
+
+RINGING = resonance(120.0, 3, 0.08, 2e-3)
+DRIVEN = resonance(90.0, 8, 0.15, 3e-2) + resonance(230.0, 8, 0.05, 3e-3)
+
+
+def band(seconds: float, seed: int) -> np.ndarray:
+    x = lfilter(*butter(2, [30, 400], "bandpass", fs=FS), noise(seconds, seed))
+    return 3.0 * x / np.std(x)
+
+
+@pytest.mark.parametrize(
+    ("later", "rated_power", "seed"),
+    [(-RINGING, 1200.0, 2), (np.r_[np.zeros(4), RINGING], 9500.0, 3), (resonance(145.0, 3, 0.08, 2e-3), 9500.0, 5)],
+    ids=["sign", "late", "frequency"],
+)
+def test_a_block_shorter_than_the_paths_does_not_hold_a_wrong_one(
+    later: np.ndarray, rated_power: float, seed: int
+) -> None:
+    """A block of 64 samples tells little of 330 taps, so that no error was a surprise: the wrong path was held for good."""
+    changed = Plant(RINGING, DRIVEN, fs=FS, sensor_noise_std=2e-5).changed_at(10.0, secondary=later)
+    x = band(20.0, seed)
+    own, fresh = (kf_pb(128, RINGING, rated_power=rated_power, fs=FS) for _ in range(2))
+    runs = [
+        simulate(own, x, changed, rng=seed, switch_on_s=2.0),
+        simulate(fresh, x[-20000:], changed.at(11.0), rng=9),
+    ]
+    reached, best = (noise_reduction_db(run.error[-10000:], run.disturbance[-10000:], steady=1.0) for run in runs)
+    assert reached > best - 1.0
+
+
+def test_what_little_data_told_of_a_path_is_not_expected() -> None:
+    """While the reference hears hum, surprises follow each other; a wild path was believed, and nothing was played again."""
+    x, seconds = band(34.0, 5), np.arange(68000) / FS
+    d = np.convolve(x, DRIVEN)[: x.size]
+    seen = np.where((seconds >= 9.0) & (seconds < 14.0), 0.03 * np.sin(2 * np.pi * 50.0 * seconds), x)
+    controller = kf_pb(128, RINGING, rated_power=1200.0, fs=FS)
+    result = simulate(
+        controller, seen, Plant(RINGING, fs=FS, sensor_noise_std=2e-5), disturbance=d, rng=5, switch_on_s=2.0
+    )
+    assert controller.alarms > 2
+    assert noise_reduction_db(result.error[-10000:], d[-10000:], steady=1.0) > 9.0
+
+
 @pytest.mark.parametrize("louder_db", [9.0, 10.0, 18.0])
 def test_what_a_softer_noise_has_saved_is_spent_evenly(louder_db: float) -> None:
     """From half a second after the noise has become louder on, for more than the averaging time."""

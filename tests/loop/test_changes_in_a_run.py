@@ -166,6 +166,7 @@ REFUSED = [
     ),
     ({"at": 0.04, "primary": S}, "time_s must not be before the last change, at 0.05 s, got 0.04 s: chain"),
     ({"at": 0.2, "secondary": [[S], [S]]}, r"secondary must keep its channels .* \(1, 1\), got taps \(2, 1, 3\)"),
+    ({"at": 0.2, "secondary": [[S, S]]}, r"secondary must keep its channels .* \(1, 1\), got taps \(1, 2, 3\)"),
     ({"at": 0.2, "feedback": [1.0, 1.0]}, "feedback must have a delay"),
     ({"at": 0.2, "amplifier": "loud"}, "amplifier must be a function of a sample"),
     ({"at": 0.2, "primary": [1.0]}, "primary cannot appear during a run"),

@@ -31,7 +31,7 @@ REFUSED = [
         TypeError,
         r"the plant has sensor noise \(sensor_noise_std=0.1\): give rng=, a seed or a numpy.random.Generator",
     ),
-    ({"switch_on_s": 300 / FS}, ValueError, "switch_on_s must leave samples to control"),
+    ({"switch_on_s": 300 / FS}, ValueError, "switch_on_s must be less than the signal's"),
     ({"record_weights_every": 0.5}, TypeError, "record_weights_every must be a whole number"),
 ]
 

@@ -114,7 +114,7 @@ class Plant:
         self.unit = self.signs(core.DRAWS, self.mask.size) * self.mask
         self.theta = np.concatenate([self.mean, 0 * self.unit])
         self.q, self.significant, self.precision = np.zeros(self.K), 1.0, np.zeros(self.mask.size)
-        self.begun = self.waiting = self.silent = False  # waiting: no fit of a whole block since a surprise
+        self.begun = self.waiting = self.silent = self.on_trial = False  # waiting: for a fit of a whole block
         self.fits = self.surprises = self.turn = 0
         self.missed = self.expected = 0.0
 
@@ -187,6 +187,8 @@ class Plant:
             doubt = np.mean(self.q) * self.n / max(self.count, 1.0)
         else:
             doubt = np.mean(self.q) * np.sum((self.theta[self.K :] @ Z.T) ** 2) / (np.sum(w**2) * core.DRAWS)
+        if self.on_trial:
+            doubt, self.on_trial = min(doubt, d2 / core.SURPRISE**2), False
         limit = core.SURPRISE * (noise + doubt)
         last = self.B * (core.PARTS_OF_BLOCK - 1) // core.PARTS_OF_BLOCK
         at_last, missed = (np.sum(missed[i:]) / np.sum(w[i:] ** 2) for i in (last, 0))
@@ -200,11 +202,13 @@ class Plant:
             self.silent = heard >= d2  # the control does no good: listen to p alone
             s = self.paths()[1][self.K :]
             doubt = math.sqrt(np.sum(s**2) / np.sum(self.s_hat**2))
+            learned = not self.exact and 2 * doubt < self.spread
+            if learned:
+                self.mean[:, self.split :] = self.theta[: self.K, self.split :]
             if self.silent or self.spread <= core.HELD:
                 self.spread = core.REDRAWN
-            elif 2 * doubt < self.spread:
-                self.spread = core.HELD  # s has been learned, and is as it was
-            self.mean[:, self.split :] = self.theta[: self.K, self.split :]
+            elif learned:
+                self.spread, self.on_trial = core.HELD, True  # s is as it was
             self.begin(z, 0)
         return not surprised
 
