@@ -228,7 +228,9 @@ class Plant:
             reason = f": by then the last change of {' or '.join(sorted(changed))} has ended" if same else ""
             raise ValueError(f"time_s must be {free / self.fs:g} s at least, got {at:g} s{reason}")
         now = self._changes[-1].plant if self._changes else self
-        for name in changed & set(PATHS):
+        if now.primary is None and primary is not None:
+            raise ValueError("primary cannot appear during a run: make the plant with a primary path")
+        for name in (name for name in PATHS if name in changed):
             old, taps = getattr(now, name), READERS[name](given[name], fs=self.fs, n_taps=self._n_path, name=name)[0]
             if old is not None and old.shape[:2] != taps.shape[:2]:
                 raise ValueError(
@@ -243,8 +245,6 @@ class Plant:
             n_path=self._n_path,
             sensor_noise_std=self.sensor_noise_std,
         )
-        if now.primary is None and primary is not None:
-            raise ValueError("primary cannot appear during a run: make the plant with a primary path")
         other = copy(self)
         other._changes = (*self._changes, _Change(at, begin, round(fade * self.fs), changed, then))
         return other

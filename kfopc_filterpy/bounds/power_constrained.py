@@ -135,8 +135,8 @@ class PowerConstrainedWiener:
 
     def __repr__(self) -> str:
         seconds = self.disturbance.shape[-1] / self.fs
-        reached = f"noise reduction {self.per_second.noise_reduction_db:.1f} dB within the rated power"
-        free = f"{self.unconstrained.noise_reduction_db:.1f} dB without it"
+        reached = f"noise reduction {self.per_second.noise_reduction_db:.1f} dB within the rated power of each second"
+        free = f"{self.unconstrained.noise_reduction_db:.1f} dB with any power"
         return f"<PowerConstrainedWiener: {seconds:g} s at {self.fs:g} Hz, {reached}, {free}>"
 
     def noise_reduction_over(self, start_s: float = 0.0, end_s: float | None = None) -> dict[str, float]:

@@ -528,7 +528,7 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     int surprised = is->missed > SURPRISE * noise * each;
     if (surprised) {
         real doubt = power_of_doubt(f);
-        /* A block that is shorter than p leaves so much doubt that no wrong hold would surprise. */
+        /* After a block that is shorter than p, the doubt would hide even a wrong path. */
         if (on_trial) doubt = smaller(doubt, is->expected / (SURPRISE * SURPRISE * each));
         const real limit = SURPRISE * (noise + doubt);
         surprised = is->missed > limit * each;

@@ -160,7 +160,7 @@ def amplifier_models(amplifier: Amplifier | Sequence[Amplifier | None] | None, n
     if len(models) != n_loudspeakers or any(model is None for model in models):
         for_each = f", or one for each of the {n_loudspeakers} loudspeakers" if n_loudspeakers > 1 else ""
         raise TypeError(
-            "amplifier must be None or one of kfopc_filterpy's amplifier models, such as HardClipAmplifier"
+            "amplifier must be None or one of kfopc_filterpy's amplifier models, such as HardClipAmplifier(limit=1.0)"
             f"{for_each}, got {amplifier!r}"
         )
     return np.array(models).view(np.float64).reshape(n_loudspeakers, -1)
