@@ -134,11 +134,15 @@ static real precision_of(const posterior *f, int32_t c)
     return c < f->I ? f->numbers->precision : f->numbers->precision_s;
 }
 
-/* Return the energy in the data of the signals from `begin` to `end`. */
+/* Return the energy in the data of the signals from `begin` to `end`, without the samples before
+ * the first row, which are in the lags. */
 static real energy_of_data(const posterior *f, int32_t begin, int32_t end)
 {
     real energy = 0;
-    for (int32_t c = begin; c < end; c++) energy += f->T[times(c * f->C + c, f->N)];
+    for (int32_t c = begin; c < end; c++) {
+        const real *before = f->before + times(c, f->N);
+        energy += larger(f->T[times(c * f->C + c, f->N)] - dot(before, before, f->N), 0);
+    }
     return energy;
 }
 
@@ -600,9 +604,24 @@ static void learn_samples(posterior *f, int32_t newest, real forget)
         f->counts[WAITING] = f->counts[SILENT] = 0;
 }
 
+/* Return whether the references have set in after silence. It may have been a fault of theirs: what
+ * is in the delay lines is not known then. */
+static int have_set_in(const posterior *f)
+{
+    const int32_t B = f->B, n = f->N - 1;
+    real block = 0, before = 0;
+    for (int32_t i = 0; i < f->I; i++) {
+        const real *x = history_of(f, i);
+        block += dot(x, x, B);
+        before += dot(x + B, x + B, n);
+    }
+    return block * (real)n > LOUDER * LOUDER * before * (real)B;
+}
+
 void learn(posterior *f, real forget)
 {
     if (f->heard[HEARD] < 1 << 30) f->heard[HEARD] += f->B;
+    if (f->counts[BEGUN] && have_set_in(f)) f->heard[HEARD] = 0;
     /* Rows whose delay lines are known; at first, as many as a path has taps. */
     const int32_t rows = f->heard[HEARD] - f->N, least = f->counts[BEGUN] ? f->B : f->N;
     int32_t newest = 0;

@@ -221,17 +221,20 @@ def test_a_block_shorter_than_the_paths_does_not_hold_a_wrong_one(
     assert reached > best - 1.0
 
 
-def test_what_little_data_told_of_a_path_is_not_expected() -> None:
-    """While the reference hears hum, surprises follow each other. If a wild path is expected, nothing is ever played: 0 dB."""
-    x, seconds = band(34.0, 5), np.arange(68000) / FS
+@pytest.mark.parametrize("hum", [0.0, 0.03])
+def test_a_reference_that_was_unplugged_is_as_good_as_before_a_second_later(hum: float) -> None:
+    """Its delay lines hold what was not there. Learned from, that leaves less than 20 of 46 dB for seconds."""
+    x, seconds = band(18.0, 4), np.arange(36000) / FS
     d = np.convolve(x, DRIVEN)[: x.size]
-    seen = np.where((seconds >= 9.0) & (seconds < 14.0), 0.03 * np.sin(2 * np.pi * 50.0 * seconds), x)
-    controller = kf_pb(128, RINGING, rated_power=1200.0, fs=FS)
-    result = simulate(
-        controller, seen, Plant(RINGING, fs=FS, sensor_noise_std=2e-5), disturbance=d, rng=80, switch_on_s=2.0
+    unplugged = (seconds >= 8.0) & (seconds < 13.0)
+    seen = np.where(unplugged, hum * np.sin(2 * np.pi * 50.0 * seconds), x)
+    plant = Plant(RINGING, fs=FS, sensor_noise_std=2e-5)
+    result = simulate(kf_pb(128, plant, rated_power=9500.0), seen, plant, disturbance=d, rng=80, switch_on_s=2.0)
+    before, after = (
+        noise_reduction_db(result.error[part], result.disturbance[part], steady=1.0)
+        for part in (slice(8000, 12000), slice(24000, None))
     )
-    assert controller.alarms > 2  # the last of which have little data
-    assert noise_reduction_db(result.error[-10000:], d[-10000:], steady=1.0) > 9.0  # 10 without hum
+    assert after > before - 1.0 > 44.0
 
 
 @pytest.mark.parametrize("louder_db", [9.0, 10.0, 18.0])

@@ -134,7 +134,7 @@ class Plant:
 
     def energy_of(self, signals):
         """Return the energy of some of the signals in the data."""
-        return np.sum(np.diagonal(self.T[..., 0])[signals])
+        return np.sum(np.diagonal((self.T - self.before)[..., 0])[signals])
 
     def begin(self, z, newest):
         """Begin the data with the `newest` samples; z (C, N - 1 + B) ends with the block."""
@@ -371,6 +371,9 @@ class PowerBudget(Controller):
         self.new, self.asked = [], []
         self.set_room()
         self.heard += self.B
+        loud, soft = (np.mean(np.sum(part**2, axis=0)) for part in (x, self.x_past[:, : -self.B]))
+        if self.plant.begun and loud > core.LOUDER**2 * soft:  # after a fault, the delay lines are not known
+            self.heard = 0
         rows = self.heard - self.N  # whose delay lines are known; at first, as many as a path has taps
         if self.plant.begun or rows >= self.N:
             whole = np.all(np.isfinite(e)) and (rows >= self.B or not self.plant.begun)
