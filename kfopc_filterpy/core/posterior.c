@@ -506,10 +506,12 @@ static judgement judge(posterior *f)
     return found;
 }
 
-/* Return the rms error over the secondary paths that is left, by the draws. */
+/* Return the rms error over the secondary paths that is left, by the draws. Of an exact path,
+ * nothing is learned. */
 static real doubt_of_paths(const posterior *f)
 {
     real sum = 0, *path = f->right;
+    if (f->exact) return f->numbers->spread;
     for (int32_t row = f->K; row < f->rows; row++)
         for (int32_t c = f->I; c < f->C; c++) {
             path_of(f, row, c, path);
@@ -547,7 +549,7 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     f->counts[WAITING] = 1;
     /* If the control does no good, listen to p alone. */
     f->counts[SILENT] = is->heard / (real)f->B >= is->expected / count;
-    const int learned = !f->exact && 2 * doubt_of_paths(f) < known->spread;
+    const int learned = 2 * doubt_of_paths(f) < known->spread;
     if (learned) expect_learned(f);
     /* If it does good, s is as it was learned, unless that was wrong at the last surprise. */
     if (f->counts[SILENT] || known->spread <= HELD)
