@@ -114,7 +114,8 @@ class Plant:
         self.unit = self.signs(core.DRAWS, self.mask.size) * self.mask
         self.theta = np.concatenate([self.mean, 0 * self.unit])
         self.q, self.significant, self.precision = np.zeros(self.K), 1.0, np.zeros(self.mask.size)
-        self.begun = self.waiting = self.silent = self.on_trial = False  # waiting: since a surprise
+        # waiting: no fit of a whole block since a surprise; on_trial: no block judged since s was held
+        self.begun = self.waiting = self.silent = self.on_trial = False
         self.fits = self.surprises = self.turn = 0
         self.missed = self.expected = 0.0
 
