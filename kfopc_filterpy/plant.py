@@ -230,20 +230,18 @@ class Plant:
         now = self._changes[-1].plant if self._changes else self
         if now.primary is None and primary is not None:
             raise ValueError("primary cannot appear during a run: make the plant with a primary path")
-        for name in (name for name in PATHS if name in changed):
-            old, taps = getattr(now, name), READERS[name](given[name], fs=self.fs, n_taps=self._n_path, name=name)[0]
-            if old is not None and old.shape[:2] != taps.shape[:2]:
+        paths = {name: getattr(now, name) for name in PATHS}
+        for name, old in paths.items():
+            if given[name] is None:
+                continue
+            paths[name], _ = READERS[name](given[name], fs=self.fs, n_taps=self._n_path, name=name)
+            if old is not None and old.shape[:2] != paths[name].shape[:2]:
                 raise ValueError(
-                    f"{name} must keep its channels when it changes, {old.shape[:2]}, got taps {taps.shape}"
+                    f"{name} must keep its channels when it changes, {old.shape[:2]}, got taps {paths[name].shape}"
                 )
+        amplifiers = now.amplifiers if amplifier is None else amplifier
         then = Plant(
-            now.secondary if secondary is None else secondary,
-            now.primary if primary is None else primary,
-            feedback=now.feedback if feedback is None else feedback,
-            amplifier=now.amplifiers if amplifier is None else amplifier,
-            fs=self.fs,
-            n_path=self._n_path,
-            sensor_noise_std=self.sensor_noise_std,
+            **paths, amplifier=amplifiers, fs=self.fs, n_path=self._n_path, sensor_noise_std=self.sensor_noise_std
         )
         other = copy(self)
         other._changes = (*self._changes, _Change(at, begin, round(fade * self.fs), changed, then))

@@ -25,7 +25,7 @@ class KalmanController(CoreController):
         Filter whose state is the control filter, ``dim_z = 1``; a `KFOPC`, or filterpy's own.
     secondary : array_like, shape (n_taps,), control system, Recording or Plant
         Estimated secondary path.
-    amplifier : callable, optional
+    amplifier : amplifier model, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     name : str, optional
         Name in results and legends; by default KF-OPC with a rated power, else KF-ANC.

@@ -145,12 +145,17 @@ def _each(amplifier: Any, n_loudspeakers: int) -> list[Any]:
     return list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
 
 
+def _or_each(n_loudspeakers: int) -> str:
+    """Return the words for what may also be given for each loudspeaker."""
+    return f", or one for each of the {n_loudspeakers} loudspeakers" if n_loudspeakers > 1 else ""
+
+
 def amplifier_of_each(amplifier: Any, n_loudspeakers: int) -> list[Any]:
     """Return the amplifier of each loudspeaker, a function or None, from one for all or one for each."""
     each = _each(amplifier, n_loudspeakers)
     if len(each) != n_loudspeakers or not all(one is None or callable(one) for one in each):
-        for_each = f", or one for each of the {n_loudspeakers} loudspeakers" if n_loudspeakers > 1 else ""
-        raise TypeError(f"amplifier must be a function of a sample{for_each}, or None, got {amplifier!r}")
+        or_each = _or_each(n_loudspeakers)
+        raise TypeError(f"amplifier must be a function of a sample{or_each}, or None, got {amplifier!r}")
     return each
 
 
@@ -158,9 +163,8 @@ def amplifier_models(amplifier: Amplifier | Sequence[Amplifier | None] | None, n
     """Return kind, limit and sharpness of the amplifier models of all loudspeakers, (J, 3)."""
     models = [compiled_model(one) for one in _each(amplifier, n_loudspeakers)]
     if len(models) != n_loudspeakers or any(model is None for model in models):
-        for_each = f", or one for each of the {n_loudspeakers} loudspeakers" if n_loudspeakers > 1 else ""
         raise TypeError(
             "amplifier must be None or one of kfopc_filterpy's amplifier models, such as HardClipAmplifier(limit=1.0)"
-            f"{for_each}, got {amplifier!r}"
+            f"{_or_each(n_loudspeakers)}, got {amplifier!r}"
         )
     return np.array(models).view(np.float64).reshape(n_loudspeakers, -1)
