@@ -528,31 +528,36 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     /* The noise grows with the disturbance, as it did before. */
     const real grown =
         known->expected > 0 ? known->missed / known->expected * is->expected / each : 0;
-    const real noise = larger(mean_noise(f), grown);
     const int on_trial = f->counts[ON_TRIAL];
-    f->counts[ON_TRIAL] = 0;
+    const real noise = on_trial ? mean_noise(f) : larger(mean_noise(f), grown);
     int surprised = is->missed > SURPRISE * noise * each;
     if (surprised) {
         real doubt = power_of_doubt(f);
-        /* After a block that is shorter than p, the doubt would hide even a wrong path. */
+        /* After a block that is shorter than p, the doubt would hide even a wrong path, and so
+         * would the surprise as a part of the noise. */
         if (on_trial) doubt = smaller(doubt, is->expected / (SURPRISE * SURPRISE * each));
         const real limit = SURPRISE * (noise + doubt);
         surprised = is->missed > limit * each;
         if (surprised && is->missed_at_last <= limit * count_of(f, last_part(f)) * (real)f->K)
             return 0;
     }
-    forget = raised(forget, f->B);
-    known->missed = forget * known->missed + smaller(is->missed, is->expected);
-    known->expected = forget * known->expected + is->expected;
+    f->counts[ON_TRIAL] = 0;
+    /* While fewer samples than taps are known, what is missed is no noise. */
+    if (known->samples > (real)f->n) {
+        forget = raised(forget, f->B);
+        known->missed = forget * known->missed + smaller(is->missed, is->expected);
+        known->expected = forget * known->expected + is->expected;
+    }
     if (!surprised) return 1;
     count_up(f->alarms);
     f->counts[WAITING] = 1;
-    /* If the control does no good, listen to p alone. */
-    f->counts[SILENT] = is->heard / (real)f->B >= is->expected / count;
+    /* If the control does little good, listen to p alone. */
+    const real heard = is->heard / (real)f->B, expected = is->expected / count;
+    f->counts[SILENT] = LOUDER * heard >= expected;
     const int learned = 2 * doubt_of_paths(f) < known->spread;
     if (learned) expect_learned(f);
-    /* If it does good, s is as it was learned, unless that was wrong at the last surprise. */
-    if (f->counts[SILENT] || known->spread <= HELD)
+    /* If it does any good, s is as it was learned, unless that was wrong at the last surprise. */
+    if (heard >= expected || known->spread <= HELD)
         known->spread = REDRAWN;
     else if (learned) {
         known->spread = HELD;

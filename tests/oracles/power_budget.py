@@ -183,30 +183,34 @@ class Plant:
 
     def believes(self, missed, d2, heard, z, Z, w):
         """Return whether a block is to be believed; forget all if it tells of another plant."""
-        noise = max(np.mean(self.q), self.missed / max(self.expected, 1e-300) * d2)
+        noise = np.mean(self.q)
+        if not self.on_trial:  # it grows with the disturbance
+            noise = max(noise, self.missed / max(self.expected, 1e-300) * d2)
         if self.exact:
             doubt = np.mean(self.q) * self.n / max(self.count, 1.0)
         else:
             doubt = np.mean(self.q) * np.sum((self.theta[self.K :] @ Z.T) ** 2) / (np.sum(w**2) * core.DRAWS)
         if self.on_trial:
-            doubt, self.on_trial = min(doubt, d2 / core.SURPRISE**2), False
+            doubt = min(doubt, d2 / core.SURPRISE**2)
         limit = core.SURPRISE * (noise + doubt)
         last = self.B * (core.PARTS_OF_BLOCK - 1) // core.PARTS_OF_BLOCK
         at_last, missed = (np.sum(missed[i:]) / np.sum(w[i:] ** 2) for i in (last, 0))
         surprised = missed > limit
         if surprised and at_last <= limit:
             return False  # over already
-        self.missed = self.forget * self.missed + min(missed, d2)
-        self.expected = self.forget * self.expected + d2
+        self.on_trial = False
+        if self.count > self.n:  # with fewer samples, what is missed is no noise
+            self.missed = self.forget * self.missed + min(missed, d2)
+            self.expected = self.forget * self.expected + d2
         if surprised:
             self.waiting, self.surprises = True, self.surprises + 1
-            self.silent = heard >= d2  # the control does no good: listen to p alone
+            self.silent = core.LOUDER * heard >= d2  # the control does little good: listen to p alone
             s = self.paths()[1][self.K :]
             doubt = math.sqrt(np.sum(s**2) / np.sum(self.s_hat**2))
             learned = not self.exact and 2 * doubt < self.spread
             if learned:
                 self.mean[:, self.split :] = self.theta[: self.K, self.split :]
-            if self.silent or self.spread <= core.HELD:
+            if heard >= d2 or self.spread <= core.HELD:
                 self.spread = core.REDRAWN
             elif learned:
                 self.spread, self.on_trial = core.HELD, True  # s is as it was
