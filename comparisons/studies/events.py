@@ -34,7 +34,7 @@ EVENTS: dict[str, tuple[str, float, dict[str, float]]] = {  # by name: what chan
     "start, ample power": ("nothing", 0.0, {"rated_power": 20.0}),
     **{f"primary path's sign at {t:g} s": ("primary path's sign", t, {}) for t in (0.4, 1.0, 8.0)},
     **{f"secondary path's sign at {t:g} s": ("secondary path's sign", t, {}) for t in (0.4, 1.0, 8.0)},
-    **{f"secondary path late at {t:g} s": ("secondary path 2 samples late", t, {}) for t in (0.4, 1.0, 8.0)},
+    **{f"secondary path late at {t:g} s": ("secondary path 2 samples late", t, {}) for t in (0.4, 8.0)},
     **{
         what: (what, at_s, {})
         for what, at_s in {
@@ -58,7 +58,6 @@ EVENTS: dict[str, tuple[str, float, dict[str, float]]] = {  # by name: what chan
     },
     "averaging_s=600, sign at 30 s": ("primary path's sign", 30.0, {"averaging_s": 600.0}),
     "averaging_s=1, sign at 8 s": ("primary path's sign", 8.0, {"averaging_s": 1.0}),
-    "48 kHz": ("nothing", 4.0, {"fs": 48000.0}),
     "48 kHz, seams": ("seams of a recording", 3.7, {"fs": 48000.0}),
 }
 
