@@ -26,7 +26,7 @@ PLANT = Plant(SECONDARY, np.eye(60)[40], fs=FS)
 BAND_HZ = (100.0, 2000.0)
 SENSOR_NOISE = 0.01
 AFTER_S = 10.0  # that are judged after an event
-PARTS_OF_BLOCK = (0.0, 0.25, 0.5, 0.75)  # of KF-PB, after which an event begins
+DELAYS = (0.0, 0.25, 0.5, 0.75)  # of an event, in blocks of KF-PB
 SEED = 1
 EVENTS: dict[str, tuple[str, float, dict[str, float]]] = {  # by name: what changes, when in s, settings of KF-PB
     "nothing": ("nothing", 8.0, {}),
@@ -141,7 +141,7 @@ def converter_table(runs: Runs) -> Table:
 
 @dataclass(frozen=True)
 class EventRow:
-    """What KF-PB did after an event, at worst if this began in several parts of a block."""
+    """What KF-PB did after an event: the worst figures of all delays."""
 
     event: str
     alarms: int
@@ -151,12 +151,12 @@ class EventRow:
     power: float  # largest over any averaging time, over the rated one
 
 
-def event(name: str, part_of_block: float = 0.0) -> Event:
-    """Return a run of the plant of the README, with an event that begins in some part of a block, except at the start."""
+def event(name: str, delay: float = 0.0) -> Event:
+    """Return a run of the plant of the README, with an event that is delayed by a part of a block of KF-PB."""
     what, at_s, own = EVENTS[name]
     change, settings = CHANGES[what], {"fs": FS, "rated_power": RATED} | own
     fs = settings["fs"]
-    at_s += part_of_block * BLOCK_S if at_s > 0 else 0.0
+    at_s += delay * BLOCK_S
     at, end = round(at_s * fs), round((at_s + change.lasting_s) * fs)
     n = end + round(AFTER_S * fs)
     x = change.noise(band_limited_noise(BAND_HZ, n / fs, fs=fs, rng=SEED), at, fs)
@@ -219,11 +219,11 @@ def judge(event: Event, error: np.ndarray, y: np.ndarray, alarms: int) -> EventR
     )
 
 
-def event_row(name: str, parts_of_block: Sequence[float] = PARTS_OF_BLOCK) -> EventRow:
-    """Run KF-PB through an event that begins in each part of a block, and return its worst figures."""
+def event_row(name: str, delays: Sequence[float] = DELAYS) -> EventRow:
+    """Run KF-PB through an event with each delay, or at the start of the run, and return its worst figures."""
     rows = []
-    for part in parts_of_block[: None if EVENTS[name][1] > 0 else 1]:
-        own = event(name, part)
+    for delay in delays if EVENTS[name][1] > 0 else (0.0,):
+        own = event(name, delay)
         controller = kf_pb(N_TAPS, SECONDARY, **own.settings)
         rows.append(judge(own, *played(own, controller), controller.alarms))
     return EventRow(
@@ -274,7 +274,7 @@ def main(runs: Runs) -> StudyReport:
             "KF-PB with its default settings, when the plant, the noise or a microphone changes: noise reduction lost to the "
             "bound of each second, for the plant as it is after the change; the loudest second and 100 ms, over the noise "
             "without control; the largest power over any averaging time, over the rated one. Each figure is the worst of four "
-            "runs, in which the event begins in different parts of a block of KF-PB."
+            "noises, with which the event begins in different parts of a block of KF-PB; events at the start are run once."
         ),
         parameters={
             "n_taps": Parameter(N_TAPS, "of KF-PB and of the bound"),

@@ -149,8 +149,8 @@ def kf_pb(
     the power of the error by less than half of the measurement noise.
 
     Both paths are verified while they are used. If the errors contradict the posterior, the plant has changed, and all
-    that was learned is forgotten. Unless the control still does much good, the loudspeakers are silent for a block or
-    two, until the paths are learned again. If a new `secondary` is assigned, the posterior begins anew, too. The
+    that was learned is forgotten. Unless the control still reduces the noise by 8 dB, the loudspeakers are silent for a
+    block or two, until the paths are learned again. If a new `secondary` is assigned, the posterior begins anew, too. The
     account stays, and the control filter stays until the first solution.
 
     Parameters

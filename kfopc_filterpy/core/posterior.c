@@ -8,6 +8,9 @@ static const real SURPRISE = 10;
  * sqrt(2); if the primary path alone has changed, so little that a drift of the primary path is not
  * taken for an error of both. */
 static const real REDRAWN = (real)1.4142135623730951, HELD = (real)1e-3;
+/* At a surprise, the loudspeakers play on only if they still reduce the power of the noise by this
+ * factor: how much of what is left is due to a wrong s can only be told in silence. */
+static const real PLAYS_ON = 6;
 /* An error that is over before the last of so many parts of a block is a click or a clipped peak,
  * not another plant. */
 enum { PARTS_OF_BLOCK = 8 };
@@ -525,7 +528,8 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
 {
     posterior_numbers *known = f->numbers;
     const real count = count_of(f, f->B), each = count * (real)f->K;
-    /* The noise grows with the disturbance, as it did before. */
+    /* The noise grows with the disturbance, as it did before. On trial, what was missed holds the
+     * surprise, and would hide a wrong s. */
     const real grown =
         known->expected > 0 ? known->missed / known->expected * is->expected / each : 0;
     const int on_trial = f->counts[ON_TRIAL];
@@ -533,8 +537,7 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     int surprised = is->missed > SURPRISE * noise * each;
     if (surprised) {
         real doubt = power_of_doubt(f);
-        /* After a block that is shorter than p, the doubt would hide even a wrong path, and so
-         * would the surprise as a part of the noise. */
+        /* After a block that is shorter than p, the doubt would hide a wrong s, too. */
         if (on_trial) doubt = smaller(doubt, is->expected / (SURPRISE * SURPRISE * each));
         const real limit = SURPRISE * (noise + doubt);
         surprised = is->missed > limit * each;
@@ -542,21 +545,21 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
             return 0;
     }
     f->counts[ON_TRIAL] = 0;
-    /* While fewer samples than taps are known, what is missed is no noise. */
+    /* With fewer samples than taps, what is missed is not learned yet, and no noise. */
     if (known->samples > (real)f->n) {
-        forget = raised(forget, f->B);
-        known->missed = forget * known->missed + smaller(is->missed, is->expected);
-        known->expected = forget * known->expected + is->expected;
+        const real share = raised(forget, f->B);
+        known->missed = share * known->missed + smaller(is->missed, is->expected);
+        known->expected = share * known->expected + is->expected;
     }
     if (!surprised) return 1;
     count_up(f->alarms);
     f->counts[WAITING] = 1;
-    /* If the control does little good, listen to p alone. */
     const real heard = is->heard / (real)f->B, expected = is->expected / count;
-    f->counts[SILENT] = LOUDER * heard >= expected;
+    f->counts[SILENT] = PLAYS_ON * heard >= expected;
     const int learned = 2 * doubt_of_paths(f) < known->spread;
     if (learned) expect_learned(f);
-    /* If it does any good, s is as it was learned, unless that was wrong at the last surprise. */
+    /* If the control does any good, s is as it was learned; not if it is held already, because this
+     * surprise contradicts that. */
     if (heard >= expected || known->spread <= HELD)
         known->spread = REDRAWN;
     else if (learned) {

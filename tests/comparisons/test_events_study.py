@@ -101,12 +101,22 @@ def test_a_change_is_what_its_name_says(what: str, signal: str, later: np.ndarra
     ],
 )
 def test_the_bound_is_reached_two_seconds_after(name: str, loudest_db: float) -> None:
-    """In whatever part of a block it begins: each of these has cost KF-PB 3 dB and more for seconds, or for good."""
+    """Each of these once cost KF-PB 3 dB or more for seconds, or for good, in some part of a block at least."""
     row = study.event_row(name)
     assert max(row.lost_db[2:6]) < 0.5
     assert row.loudest_second_db < loudest_db
     assert row.loudest_tenth_db < 3.0
     assert row.power < 1.02
+
+
+def test_an_event_can_be_delayed_by_a_part_of_a_block() -> None:
+    early, late = (study.event("primary path's sign at 1 s", delay) for delay in (0.0, 0.75))
+    assert late.begins - early.begins == 0.75 * 512
+    assert (
+        early.disturbance[16000] * early.reference[16000 - 40]
+        < 0.0
+        < late.disturbance[16000] * late.reference[16000 - 40]
+    )
 
 
 def test_what_a_silence_has_left_is_spent_evenly() -> None:

@@ -44,21 +44,21 @@ def random_change(seed: int) -> Change:
     s, p = impulse_response(rng, fs, m, near), impulse_response(rng, fs, n_taps, near + far)
     later_s, later_p = [
         (-s, p),
-        (np.roll(np.r_[s, 0.0], rng.integers(1, 3))[:m], p),
+        (np.r_[np.zeros(rng.integers(1, 3)), s][:m], p),
         (impulse_response(rng, fs, m, near), p),
         (2.0 * s, p),
         (s, -p),
-        (s, np.roll(np.r_[p, np.zeros(6)], rng.integers(1, 7))[:n_taps]),
+        (s, np.r_[np.zeros(rng.integers(1, 7)), p][:n_taps]),
         (s, impulse_response(rng, fs, n_taps, near + far)),
     ][rng.integers(7)]
-    rated_power = float(rng.choice([0.1, 3.0]))  # of a disturbance of 1
+    rated_power = float(rng.choice([0.3, 3.0]))  # of a disturbance of 1
     return Change(
         fs, n_taps, rated_power, s, p, later_s, later_p, rng.choice([0.4, 1, 2, 4]) + rng.uniform(0, 0.1), seed
     )
 
 
 def lost_db(change: Change) -> tuple[np.ndarray, float]:
-    """Return what each second after a change lacks, against a controller of the later plant; and how loud the loudest is."""
+    """Return what each second after a change lacks, against KF-PB on the later plant, and the level of the loudest second."""
     fs, seconds = round(change.fs), change.at_s + AFTER_S + 0.1
     x = band_limited_noise((0.01 * fs, 0.3 * fs), seconds, fs=fs, rng=change.seed)
     noise = 0.01 * np.random.default_rng(change.seed).standard_normal(x.size)
@@ -80,15 +80,15 @@ def lost_db(change: Change) -> tuple[np.ndarray, float]:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_path_that_changes_at_any_time_is_learnt(seed: int) -> None:
-    """In the third second, there is no trace of it, and no second is louder than without control."""
+    """The third second lacks less than 1 dB, and no second is 1 dB louder than without control."""
     lost, loudest = lost_db(random_change(seed))
     assert lost[2] < 1.0
     assert loudest < 1.0
 
 
 @pytest.mark.slow
-def test_hardly_any_change_of_a_path_is_remembered() -> None:
-    """A secondary path held for good although it was wrong cost one change in ten."""
+def test_at_most_one_change_in_a_hundred_leaves_a_loss() -> None:
+    """It was one in nine, when a wrong secondary path could be held."""
     found = [lost_db(random_change(seed)) for seed in range(100, 400)]
     assert np.mean([lost[2] > 1.0 for lost, _ in found]) <= 0.01
     assert max(loudest for _, loudest in found) < 1.0

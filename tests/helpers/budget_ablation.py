@@ -56,6 +56,7 @@ WITHOUT = {  # the value that takes a constant out of effect, or makes it as sma
     "SURPRISE": "1e9",
     "REDRAWN": "0.1",  # what is known before a surprise
     "HELD": "9",  # then it is REDRAWN
+    "PLAYS_ON": "1",
     "PARTS_OF_BLOCK": "1",
     "PLANT_STEPS": "1",
 }

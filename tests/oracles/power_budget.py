@@ -114,7 +114,7 @@ class Plant:
         self.unit = self.signs(core.DRAWS, self.mask.size) * self.mask
         self.theta = np.concatenate([self.mean, 0 * self.unit])
         self.q, self.significant, self.precision = np.zeros(self.K), 1.0, np.zeros(self.mask.size)
-        # waiting: no fit of a whole block since a surprise; on_trial: no block judged since s was held
+        # waiting: no fit of a whole block since a surprise; on_trial: s is held, and not confirmed yet
         self.begun = self.waiting = self.silent = self.on_trial = False
         self.fits = self.surprises = self.turn = 0
         self.missed = self.expected = 0.0
@@ -184,7 +184,7 @@ class Plant:
     def believes(self, missed, d2, heard, z, Z, w):
         """Return whether a block is to be believed; forget all if it tells of another plant."""
         noise = np.mean(self.q)
-        if not self.on_trial:  # it grows with the disturbance
+        if not self.on_trial:  # it grows with the disturbance; on trial, what was missed holds the surprise
             noise = max(noise, self.missed / max(self.expected, 1e-300) * d2)
         if self.exact:
             doubt = np.mean(self.q) * self.n / max(self.count, 1.0)
@@ -199,12 +199,12 @@ class Plant:
         if surprised and at_last <= limit:
             return False  # over already
         self.on_trial = False
-        if self.count > self.n:  # with fewer samples, what is missed is no noise
+        if self.count > self.n:  # with fewer samples, what is missed is not learned yet
             self.missed = self.forget * self.missed + min(missed, d2)
             self.expected = self.forget * self.expected + d2
         if surprised:
             self.waiting, self.surprises = True, self.surprises + 1
-            self.silent = core.LOUDER * heard >= d2  # the control does little good: listen to p alone
+            self.silent = core.PLAYS_ON * heard >= d2  # listen to p alone
             s = self.paths()[1][self.K :]
             doubt = math.sqrt(np.sum(s**2) / np.sum(self.s_hat**2))
             learned = not self.exact and 2 * doubt < self.spread
