@@ -391,12 +391,12 @@ static void respond(const posterior *f, int32_t row, int32_t begin, int32_t end,
 }
 
 /* Return the mean power of the doubt in a faded block: that of the draws; without draws, what n
- * unknown taps add. */
-static real power_of_doubt(const posterior *f)
+ * unknown taps add to the noise, and what part of d^ fewer samples than taps leave unknown. */
+static real power_of_doubt(const posterior *f, real d2)
 {
-    const real q = mean_noise(f);
+    const real q = mean_noise(f), samples = larger(f->numbers->samples, 1);
     real *heard = work_of(f, 0), doubt = 0;
-    if (f->exact) return q * (real)f->n / larger(f->numbers->samples, 1);
+    if (f->exact) return q * (real)f->n / samples + larger(1 - samples / (real)f->n, 0) * d2;
     for (int32_t row = f->K; row < f->rows; row++) {
         respond(f, row, 0, f->C, f->B, heard);
         doubt += dot(heard, heard, f->B);
@@ -536,7 +536,7 @@ static int notice_surprise(posterior *f, const judgement *is, real forget)
     const real noise = on_trial ? mean_noise(f) : larger(mean_noise(f), grown);
     int surprised = is->missed > SURPRISE * noise * each;
     if (surprised) {
-        real doubt = power_of_doubt(f);
+        real doubt = power_of_doubt(f, is->expected / each);
         /* After a block that is shorter than p, the doubt would hide a wrong s, too. */
         if (on_trial) doubt = smaller(doubt, is->expected / (SURPRISE * SURPRISE * each));
         const real limit = SURPRISE * (noise + doubt);

@@ -133,6 +133,19 @@ def test_a_block_that_is_shorter_than_the_paths_after_a_surprise() -> None:
     assert oracle.plant.surprises > 1
 
 
+@pytest.mark.parametrize("at", [340, 1137, 2037])
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_a_change_within_a_block_while_little_is_known(spread: float, at: int) -> None:
+    """With an exact path, of the primary one."""
+    s, x, d, _ = scene(11, 1, 1, 1, 2.5, M=40)
+    later = s if spread == 0 else -s
+    if spread == 0:
+        d[:, at:] *= -1.0
+    oracle, controller = pair(s, 60, 1, np.array([0.25 * np.mean(d**2)]), spread)
+    compare(oracle, controller, x, d, lambda n: s if n < at else later)
+    assert oracle.plant.surprises or at == 340
+
+
 @pytest.mark.parametrize("spread", [0.0, 0.3])
 def test_a_primary_path_that_flips_its_polarity(spread: float) -> None:
     s, x, d, _ = scene(2, 1, 1, 1, 12.0)

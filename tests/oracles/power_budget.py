@@ -187,7 +187,8 @@ class Plant:
         if not self.on_trial:  # it grows with the disturbance; on trial, what was missed holds the surprise
             noise = max(noise, self.missed / max(self.expected, 1e-300) * d2)
         if self.exact:
-            doubt = np.mean(self.q) * self.n / max(self.count, 1.0)
+            count = max(self.count, 1.0)
+            doubt = np.mean(self.q) * self.n / count + max(1.0 - count / self.n, 0.0) * d2
         else:
             doubt = np.mean(self.q) * np.sum((self.theta[self.K :] @ Z.T) ** 2) / (np.sum(w**2) * core.DRAWS)
         if self.on_trial:
