@@ -78,17 +78,9 @@ def lost_db(change: Change) -> tuple[np.ndarray, float]:
     return best - own, -float(np.min(own))
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", [*range(20), *(pytest.param(s, marks=pytest.mark.slow) for s in range(100, 400))])
 def test_a_path_that_changes_at_any_time_is_learnt(seed: int) -> None:
-    """The third second lacks less than 1 dB, and no second is 1 dB louder than without control."""
+    """A wrong secondary path can be held for good, and make the noise louder. The third second lacks less than 1 dB."""
     lost, loudest = lost_db(random_change(seed))
     assert lost[2] < 1.0
     assert loudest < 1.0
-
-
-@pytest.mark.slow
-def test_at_most_one_change_in_a_hundred_leaves_a_loss() -> None:
-    """It was one in nine, when a wrong secondary path could be held."""
-    found = [lost_db(random_change(seed)) for seed in range(100, 400)]
-    assert np.mean([lost[2] > 1.0 for lost, _ in found]) <= 0.01
-    assert max(loudest for _, loudest in found) < 1.0

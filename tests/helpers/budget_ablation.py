@@ -121,7 +121,7 @@ def clipped_peaks() -> tuple[float, float, int]:
 
 def measure(made: Path) -> dict[str, Any]:
     """Return the figures of all runs."""
-    rows = [events.event_row(name, (0.75,)) for name in events.EVENTS]
+    rows = [events.event_row(name, (0.75,)) for name in events.EVENTS]  # one delay: a run each
     of_events = {row.event: (row.lost_db[1:], row.loudest_tenth_db, row.power, row.alarms) for row in rows}
     of_cases = {}
     for name, case in pickle.loads(made.read_bytes()):
